@@ -1,0 +1,228 @@
+"""The step contract shared by every domain: batched macro-action environments and their single-environment view."""
+
+from abc import ABC, abstractmethod
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+
+class MacroVectorEnv(VectorEnv, ABC):
+    """A batch of cooperative environments whose agents run macro-actions of different lengths.
+
+    One step is one primitive time step. An agent whose last macro-action has ended starts the one it is given; the entry
+    of an agent whose macro-action is still running is ignored. A macro-observation changes only in the step in which its
+    agent's macro-action ends. The end of an episode ends every macro-action, so the final observation is everybody's.
+    Environments are not reset by themselves (`AutoresetMode.DISABLED`): pass `options={"reset_mask": terminated | truncated}`.
+
+    Attributes:
+        num_envs: number of environments N.
+        n_agents: number of agents n.
+        n_actions: macro-actions of each agent, n ints.
+        obs_sizes: length of each agent's macro-observation, n ints; shorter ones are padded with 0 to the widest, d.
+        state_size: length S of the true state, the layout of which is in the domain's docstring.
+        horizon: steps after which an episode is truncated.
+        macro_action_names: for each agent the names of its macro-actions.
+        macro_done: bool [N, n], True where the agent is free, that is, will start what the next step gives it.
+        macro_action: int64 [N, n], the macro-action running or last run, -1 before the first.
+        elapsed: int64 [N], steps taken in the episode. episode_return: float64 [N], its undiscounted return so far.
+
+    A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`; it names the
+    arrays that hold its simulator state in `sim_arrays`, the first axis of each being the environment.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 8, "autoreset_mode": AutoresetMode.DISABLED}
+    sim_arrays: tuple[str, ...] = ()
+
+    def __init__(self, num_envs, macro_action_names, obs_low, obs_high, obs_sizes, state_size, horizon, render_mode=None):
+        """Args:
+        num_envs: N >= 1. macro_action_names: a list of names for each agent. obs_low, obs_high: bounds [n, d].
+        obs_sizes: n ints <= d. state_size: S. horizon: >= 1 steps. render_mode: None or "rgb_array".
+
+        Raises:
+            ValueError: an argument is out of range.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if horizon < 1:
+            raise ValueError(f"horizon must be at least 1 step, got {horizon}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+        self.num_envs, self.horizon, self.render_mode = num_envs, horizon, render_mode
+        self.macro_action_names = [list(names) for names in macro_action_names]
+        self.n_agents, self.n_actions = len(macro_action_names), [len(names) for names in macro_action_names]
+        self.obs_sizes, self.state_size = list(obs_sizes), state_size
+        self.single_observation_space = gym.spaces.Box(np.float32(obs_low), np.float32(obs_high), dtype=np.float32)
+        self.single_action_space = gym.spaces.MultiDiscrete(self.n_actions)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._action_limit = np.array(self.n_actions)
+
+        agents = (num_envs, self.n_agents)
+        self.macro_done, self.macro_action = np.ones(agents, bool), np.full(agents, -1)
+        self.elapsed, self.episode_return = np.zeros(num_envs, np.int64), np.zeros(num_envs)
+        self.over, self.success = np.ones(num_envs, bool), np.zeros(num_envs, bool)
+        self._obs = np.zeros((num_envs, *self.single_observation_space.shape), np.float32)
+
+    # ---- what a domain implements -------------------------------------------------------------------------------
+    @abstractmethod
+    def _reset(self, mask):
+        """Puts the simulator arrays of the environments in mask, bool [N], to the start of an episode."""
+
+    @abstractmethod
+    def _advance(self):
+        """One step of `macro_action`, started in this step where `macro_done`.
+
+        Returns:
+            rewards float64 [N], terminations bool [N], ended bool [N, n] (macro-actions that end now), success bool [N].
+        """
+
+    @abstractmethod
+    def _observe(self, start):
+        """Macro-observations float32 [N, n, d] of the current simulator state; start: those of a reset."""
+
+    @abstractmethod
+    def _state(self):
+        """The true state, a new float32 array [N, S]."""
+
+    @abstractmethod
+    def _draw(self, index):
+        """A picture, uint8 [height, width, 3], of one environment."""
+
+    # ---- Gymnasium's interface ----------------------------------------------------------------------------------
+    def reset(self, *, seed=None, options=None):
+        """Starts new episodes.
+
+        Args:
+            seed: an int reseeds the generator of the whole batch, None goes on with the one in use.
+            options: `{"reset_mask": bool [N]}` resets only those environments and leaves the others as they are.
+
+        Returns:
+            obs float32 [N, n, d] and infos (as `step`, with `macro_action` -1 for an agent that has not chosen yet).
+
+        Raises:
+            ValueError: the mask has another shape or dtype, or leaves out an environment that was never reset.
+        """
+        super().reset(seed=seed)
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            mask = np.ones(self.num_envs, bool)
+        elif np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool:
+            raise ValueError(f"options['reset_mask'] must be a bool array of shape ({self.num_envs},)")
+        mask = np.asarray(mask)
+        self._reset(mask)
+        self.macro_done[mask], self.macro_action[mask] = True, -1
+        self.elapsed[mask], self.episode_return[mask] = 0, 0.0
+        self.over[mask], self.success[mask] = False, False
+        self._obs[mask] = self._observe(start=True)[mask]
+        return self._obs.copy(), self._infos()
+
+    def step(self, actions):
+        """Takes one primitive time step in every environment.
+
+        Args:
+            actions: int [N, n], the macro-action of each free agent; other entries are ignored.
+
+        Returns:
+            obs float32 [N, n, d], rewards float64 [N], terminations bool [N], truncations bool [N] and infos:
+            `macro_done` bool [N, n] (the agent's macro-action ended in this step: it chooses next), `macro_action`
+            int64 [N, n] (the one that ran), `state` float32 [N, S], `success` bool [N] (the task's goal was reached).
+
+        Raises:
+            ValueError: the array has another shape or is not of integers, an environment's episode has ended, or a free
+                agent's action is out of range.
+        """
+        actions = np.asarray(actions)
+        if actions.shape != self.macro_done.shape or actions.dtype.kind not in "iu":
+            raise ValueError(
+                f"actions must be integers of shape {self.macro_done.shape}, got {actions.dtype} {actions.shape}"
+            )
+        if self.over.any():
+            raise ValueError(
+                f"environments {np.flatnonzero(self.over)[:10].tolist()} have ended (or were never reset): "
+                "reset them first, with options={'reset_mask': terminations | truncations}"
+            )
+        bad = self.macro_done & ((actions < 0) | (actions >= self._action_limit))
+        if bad.any():
+            env, agent = np.argwhere(bad)[0]
+            raise ValueError(
+                f"agent {agent} of environment {env} was given macro-action {actions[env, agent]}: "
+                f"it has 0..{self.n_actions[agent] - 1}"
+            )
+        np.copyto(self.macro_action, actions, where=self.macro_done, casting="unsafe")
+        self.elapsed += 1
+        rewards, terminations, ended, success = self._advance()
+        self.success = success.copy()  # a later reset writes into it
+        truncations = (self.elapsed >= self.horizon) & ~terminations
+        self.over = terminations | truncations
+        self.macro_done = ended | self.over[:, None]
+        self.episode_return += rewards
+        np.copyto(self._obs, self._observe(start=False), where=self.macro_done[:, :, None])
+        return self._obs.copy(), rewards, terminations, truncations, self._infos()
+
+    def render(self):
+        """A tuple of N pictures, uint8 [height, width, 3], or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._draw(index) for index in range(self.num_envs))
+
+    def _infos(self):
+        return {
+            "macro_done": self.macro_done.copy(),
+            "macro_action": self.macro_action.copy(),
+            "state": self._state(),
+            "success": self.success.copy(),
+        }
+
+    # ---- checkpoints --------------------------------------------------------------------------------------------
+    def _checkpointed(self):
+        base = ("macro_done", "macro_action", "elapsed", "episode_return", "over", "success", "_obs")
+        return base + self.sim_arrays
+
+    def save_state(self):
+        """The whole simulator: a dict of array copies and, under "np_random", the generator's state."""
+        arrays = {name: getattr(self, name).copy() for name in self._checkpointed()}
+        return arrays | {"np_random": self.np_random.bit_generator.state}
+
+    def load_state(self, saved):
+        """Continues from what `save_state` returned; returns obs and infos as the last reset or step did.
+
+        Raises:
+            ValueError: it was saved by another kind, size or number of environments.
+        """
+        for name in self._checkpointed():
+            if name not in saved or np.shape(saved[name]) != getattr(self, name).shape:
+                raise ValueError(f"the saved state does not fit this environment: {name!r} is missing or of another shape")
+        for name in self._checkpointed():
+            setattr(self, name, np.array(saved[name]))
+        self.np_random.bit_generator.state = saved["np_random"]
+        return self._obs.copy(), self._infos()
+
+
+class SingleMacroEnv(gym.Env):
+    """One environment of a domain as a `gymnasium.Env`: the batch of one without its first axis.
+
+    `obs` is float32 [n, d], the reward a float; infos are those of `MacroVectorEnv.step`.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
+
+    def __init__(self, vector_env):
+        self.vector_env, self.render_mode = vector_env, vector_env.render_mode
+        self.observation_space = vector_env.single_observation_space
+        self.action_space = vector_env.single_action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        obs, infos = self.vector_env.reset(seed=seed)
+        return obs[0], {key: value[0] for key, value in infos.items()}
+
+    def step(self, action):
+        obs, reward, terminated, truncated, infos = self.vector_env.step(np.asarray(action)[None])
+        info = {key: value[0] for key, value in infos.items()}
+        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self):
+        frames = self.vector_env.render()
+        return frames[0] if frames else None
