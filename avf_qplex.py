@@ -1,24 +1,25 @@
 """AVF-QPLEX: asynchronous value factorization with QPLEX's duplex dueling mixer.
 
-Agents run macro-actions of different lengths and decide at different times. Each has a recurrent utility network Q_i over its
-own macro-history; the mixer combines the utilities of all, those of ongoing macro-actions included, into one joint value that
-is trained on the joint reward (paper: "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning"):
+Agents run macro-actions of different lengths and decide at different times. Each has a recurrent utility network Q_i
+over its own macro-history; a mixer combines the utilities of all of them, of ongoing macro-actions too, into one joint
+value, trained on the joint reward (paper: "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning").
 
     decision row k    a time step at which at least one agent starts a macro-action; only these are stored (Section 3.2)
-    target (Eq. 14)   y = r + gamma^tau Q'(h', s', m*), m*_i = argmax Q_i(h'_i, .) for agents that choose at the next row and
-                      the running macro-action for the others: the conditional argmax of Eqs. 5 and 7
-    mixer (Eqs. 3-4)  Q(h, s, m) = sum_i V_i + lambda_i(s, m) A_i, lambda_i >= 0, over transformed V_i, A_i (see QPLEXMixer)
+    target (Eq. 14)   y = r + gamma^tau Q'(h', s', m*), m*_i = argmax Q_i(h'_i, .) for agents that choose at the next
+                      row and the running macro-action for the others: the conditional argmax of Eqs. 5 and 7
+    mixer (Eqs. 3-4)  Q(h, s, m) = sum_i V_i + lambda_i(s, m) A_i with lambda_i >= 0, see QPLEXMixer
 
 Numbered deviations from the paper:
- 1. Ongoing agents are conditioned on what they can still choose: V_i = Q_i(h_i, m_i), so A_i = 0. The literal mixer
-    (--no-mask-ongoing) breaks Mac-IGM: an ongoing agent's negative advantage is weighted by the others' choices.
- 2. A_i = Q_i - max Q_i (Eq. 4) by default, not a dueling head with advantages of any sign (Def. 3.3). --advantage dueling gives
-    that head, with lambda_i(s): with lambda_i(s, m) free signs break the consistency of greedy choices.
- 3. Discounting is gamma^tau between decision rows; an episode that is truncated by the horizon bootstraps from its final
-    observation, a terminated one does not.
- 4. Learning rate, gamma, replay and the values the paper does not give (epsilon, update frequency, episodes) were chosen
-    by measurement, see DEFAULTS and the README. On Box Pushing they include hysteretic TD errors and Q(lambda), which the
-    paper does not use; --td-lambda 0 --hysteresis-start 1 --hysteresis-end 1 is the paper's loss.
+ 1. Ongoing agents are conditioned on what they can still choose: V_i = Q_i(h_i, m_i), hence A_i = 0. The literal mixer
+    (--no-mask-ongoing) breaks Mac-IGM: an ongoing agent's negative advantage is weighted by what the others choose.
+ 2. A_i = Q_i - max Q_i (Eq. 4), not a dueling head with advantages of any sign (Def. 3.3). --advantage dueling gives
+    that head, with lambda_i(s): with lambda_i(s, m), free signs break the consistency of greedy choices.
+ 3. The mixer's hypernetworks share one hidden layer of the same total width instead of having one each.
+ 4. Rewards and values are discounted by gamma^tau between decision rows. An episode truncated by the horizon bootstraps
+    from its final observation, a terminated one does not.
+ 5. Hyperparameters were chosen by measurement (DEFAULTS; the README says how and where they leave the paper). On Box
+    Pushing they include hysteretic TD errors and Q(lambda), which the paper does not use; --td-lambda 0
+    --hysteresis-start 1 is the paper's loss.
 """
 
 import argparse
@@ -51,7 +52,7 @@ class Args:
     env: str = "wtd-s"
     """task, one of envs.IDS"""
     seed: int = 1
-    """seed of networks, exploration, replay and environments (any integer from 0 on)"""
+    """seed of networks, exploration, replay and environments, from 0 on"""
     total_timesteps: int = 400_000
     """environment steps of the run, over all environments"""
     num_envs: int = 32
@@ -59,13 +60,13 @@ class Args:
     eval_frequency: int = 10_000
     """environment steps between greedy evaluations"""
     eval_episodes: int = 20
-    """episodes of an evaluation, each in a freshly seeded environment"""
+    """episodes of an evaluation, freshly seeded each time"""
     checkpoint_frequency: int = 100_000
     """environment steps between checkpoints, from which --resume continues exactly"""
     runs_dir: str = "runs"
     """folder in which each run makes its own"""
     device: str = "cpu"
-    """torch device: cpu or cuda"""
+    """torch device, cpu or cuda"""
     torch_threads: int = 1
     """CPU threads of torch; one is fastest for networks of this size"""
     resume: str | None = None
@@ -114,27 +115,23 @@ class Args:
     """recurrent state at the start of a window: zeros, or the one stored when acting"""
     hidden_size: int = 64
     """width of the agents' layers"""
-    mixer_state: Literal["joint", "single", "real", "decision"] = "joint"
-    """mixer input: the joint macro-state, one agent's macro-state, the state at the interval's end, the state at the row"""
     mixing_embed: int = 32
     """width of the mixer's hypernetworks"""
-    attention_heads: int = 4
-    """heads that add up to lambda_i"""
-    advantage: Literal["max", "dueling"] = "max"
-    """A_i = Q_i - max Q_i with lambda_i(s, m), or a dueling head of any sign with lambda_i(s)"""
+    mixer_state: Literal["joint", "single", "real", "decision"] = "joint"
+    """mixer input: joint macro-state, one agent's macro-state, true state at the end of the interval or at the row"""
     mask_ongoing: bool = True
     """ongoing agents have advantage 0 (deviation 1)"""
+    advantage: Literal["max", "dueling"] = "max"
+    """A_i = Q_i - max Q_i with lambda_i(s, m), or a dueling head of any sign with lambda_i(s)"""
 
 
-# What differs between the environment families; the README says how these were chosen.
+# Where the environment families need other values; the README says how they were chosen.
 DEFAULTS = {
     "wtd": {},
-    "bp": dict(
-        total_timesteps=800_000, gamma=0.95, learning_rate=3e-4, buffer_size=30_000, exploration_timesteps=500_000,
-        td_lambda=0.5, hysteresis_start=0.2, hysteresis_end=1.0,
-    ),
-    "ct": dict(total_timesteps=1_000_000, gamma=0.98, buffer_size=10_000, train_frequency=192, reward_scale=10.0,
-               exploration_timesteps=400_000, td_lambda=0.8, hysteresis_start=0.2, hysteresis_end=1.0, eval_episodes=100),
+    "bp": dict(total_timesteps=800_000, gamma=0.95, learning_rate=3e-4, buffer_size=30_000,
+               exploration_timesteps=500_000, td_lambda=0.5, hysteresis_start=0.2),
+    "ct": dict(total_timesteps=1_000_000, gamma=0.98, buffer_size=10_000, exploration_timesteps=400_000, td_lambda=0.8,
+               hysteresis_start=0.2, train_frequency=192, reward_scale=10.0, eval_episodes=100),
 }  # fmt: skip
 
 
@@ -159,37 +156,36 @@ class AgentLinear(nn.Module):
 class Agents(nn.Module):
     """The agents' utility networks, one each: Linear, ReLU, GRU, Linear, ReLU, Linear.
 
-    Args of the constructor: n_actions: list of n ints; obs_size: width d of the padded macro-observation; dueling: Q_i = V_i +
-    A_i from two heads instead of one.
+    n_actions: a list of n ints. obs_size: width d of the padded macro-observation. dueling: Q_i = V_i + A_i of two
+    heads.
     """
 
     def __init__(self, n_actions, obs_size, hidden_size, dueling=False):
         super().__init__()
-        n, widest = len(n_actions), max(n_actions)
-        self.n_agents, self.widest, self.hidden_size, self.dueling = n, widest, hidden_size, dueling
+        n, widest, bound = len(n_actions), max(n_actions), hidden_size**-0.5
+        self.n_actions, self.hidden_size, self.dueling = np.array(n_actions), hidden_size, dueling
         self.encoder = AgentLinear(n, obs_size + widest, hidden_size)
         self.gru_input = AgentLinear(n, hidden_size, 3 * hidden_size)
-        bound = hidden_size**-0.5
         self.gru_hidden = nn.Parameter(torch.empty(n, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
         self.head = AgentLinear(n, hidden_size, hidden_size)
         self.output = AgentLinear(n, hidden_size, widest + dueling)
-        padding = torch.arange(widest) >= torch.tensor(n_actions)[:, None]
-        self.register_buffer("padding", padding[:, None], persistent=False)  # [agents, 1, actions]
+        self.register_buffer("actions", torch.arange(widest), persistent=False)
+        self.register_buffer("padding", self.actions >= torch.tensor(n_actions)[:, None, None], persistent=False)
 
     def forward(self, obs, previous, hidden, sizes):
         """Runs sequences packed step by step: sizes[t] entries of step t, those of the longest sequences first.
 
         Args:
-            obs: float32 [n, M, d], M = sum(sizes). previous: int64 [n, M], last macro-action of the agent, -1 before its first.
-            hidden: float32 [n, sizes[0], H], recurrent state before the first step. sizes: falling list of ints.
+            obs: float32 [n, M, d], M = sum(sizes). previous: int64 [n, M], the agent's last macro-action, -1 for none.
+            hidden: float32 [n, sizes[0], H], recurrent state before, or None for zeros. sizes: falling list of ints.
 
         Returns:
-            utilities float32 [n, M, A] (-inf for padding actions), values V_i float32 [n, M], hidden states float32 [n, M, H].
+            utilities float32 [n, M, A] (-inf for padding actions), values V_i float32 [n, M], states float32 [n, M, H].
         """
-        action = (previous[..., None] == torch.arange(self.widest, device=obs.device)).float()  # [agents, M, actions]
-        gates = self.gru_input(F.relu(self.encoder(torch.cat([obs, action], 2))))  # [agents, M, 3 hidden]
+        one_hot = (previous[..., None] == self.actions).float()  # [agents, M, actions]
+        gates = self.gru_input(F.relu(self.encoder(torch.cat([obs, one_hot], 2))))  # [agents, M, 3 hidden]
         if hidden is None:
-            hidden = obs.new_zeros(self.n_agents, sizes[0], self.hidden_size)
+            hidden = obs.new_zeros(len(obs), sizes[0], self.hidden_size)
         states = []
         for step in gates.split(sizes, 1):
             hidden = hidden[:, : step.shape[1]]
@@ -199,59 +195,63 @@ class Agents(nn.Module):
             hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
             states.append(hidden)
         states = torch.cat(states, 1)  # [agents, M, hidden]
-        output = self.output(F.relu(self.head(states)))  # [agents, M, actions (+ 1)]
+        utilities = self.output(F.relu(self.head(states)))  # [agents, M, actions (+ 1)]
         if self.dueling:
-            values, utilities = output[..., -1], output[..., :-1] + output[..., -1:]
-            return utilities.masked_fill(self.padding, -torch.inf), values, states
-        utilities = output.masked_fill(self.padding, -torch.inf)
-        return utilities, utilities.amax(2), states
+            utilities, values = utilities[..., :-1] + utilities[..., -1:], utilities[..., -1]
+        utilities = utilities.masked_fill(self.padding, -torch.inf)
+        return utilities, values if self.dueling else utilities.amax(2), states
 
 
 class QPLEXMixer(nn.Module):
     """Duplex dueling (Wang et al. 2021) for agents some of which are ongoing.
 
     Transformed: Q_i <- w_i(s) Q_i + b_i(s), V_i <- w_i(s) V_i + b_i(s), w_i > 0, and A_i = Q_i - V_i. Then
-    Q(h, s, m) = sum_i Q_i + sum_i (lambda_i - 1) stopgrad(A_i), which is sum_i V_i + lambda_i A_i, with
-    lambda_i = sum over heads of |key(s)| sigmoid(agents_i(s)) sigmoid(action_i(s, m)) >= 0.
+    Q(h, s, m) = sum_i Q_i + sum_i (lambda_i - 1) stopgrad(A_i), which equals sum_i V_i + lambda_i A_i, with
+    lambda_i = sum over heads of |key(s)| sigmoid(agent_i(s)) sigmoid(action_i(s, m)) >= 0.
 
-    Args of the constructor: n_actions: list of n ints. state_size: width of the mixer input. embed: width of the
-    hypernetworks. heads: attention heads. mask_ongoing: A_i = 0 for ongoing agents. joint_action: lambda_i depends on m.
+    n_actions: a list of n ints. state_size: width of the mixer input. mask_ongoing: A_i = 0 for ongoing agents.
+    joint_action: lambda_i depends on m.
     """
 
     def __init__(self, n_actions, state_size, embed=32, heads=4, mask_ongoing=True, joint_action=True):
         super().__init__()
-        n, self.widest, self.heads = len(n_actions), max(n_actions), heads
-        self.mask_ongoing, self.joint_action = mask_ongoing, joint_action
+        n, widest = len(n_actions), max(n_actions)
+        self.heads, self.mask_ongoing, self.joint_action = heads, mask_ongoing, joint_action
 
         def hypernetwork(inputs, outputs):
             return nn.Sequential(nn.Linear(inputs, heads * embed), nn.ReLU(True), nn.Linear(heads * embed, outputs))
 
         self.of_state = hypernetwork(state_size, 2 * n + heads + heads * n)
         if joint_action:
-            self.of_action = hypernetwork(state_size + n * self.widest, heads * n)
+            self.of_action = hypernetwork(state_size + n * widest, heads * n)
+        self.register_buffer("actions", torch.arange(widest), persistent=False)
 
     def forward(self, utilities, values, actions, chosen, state):
-        """utilities Q_i(h_i, m_i) and values V_i: float32 [..., n]; actions m: int64 [..., n]; chosen: bool [..., n], False
-        for ongoing agents; state: float32 [..., S]. Returns the joint values, float32 [...]."""
+        """The joint value, float32 [...].
+
+        Args:
+            utilities, values: Q_i(h_i, m_i) and V_i(h_i), float32 [..., n]. actions: m, int64 [..., n].
+            chosen: bool [..., n], False for ongoing agents. state: float32 [..., S].
+        """
+        n = utilities.shape[-1]
         if self.mask_ongoing:  # an ongoing agent can only go on: its value is that of its macro-action
             values = torch.where(chosen, values, utilities)
-        n = utilities.shape[-1]
-        weight, bias, key, agents = self.of_state(state).split([n, n, self.heads, self.heads * n], -1)
+        weight, bias, key, agent = self.of_state(state).split([n, n, self.heads, self.heads * n], -1)
         weight = weight.abs() + 1e-10  # positive: the transform keeps each agent's order of macro-actions
         advantages = (weight * (utilities - values)).detach()
-        attention = key.abs()[..., None] * torch.sigmoid(agents.unflatten(-1, (self.heads, n)))  # [..., heads, agents]
+        attention = key.abs()[..., None] * torch.sigmoid(agent.unflatten(-1, (self.heads, n)))  # [..., heads, agents]
         if self.joint_action:
-            joint = (actions[..., None] == torch.arange(self.widest, device=actions.device)).float()
-            inputs = torch.cat([state, joint.flatten(-2)], -1)  # [..., S + agents * actions]
-            attention = attention * torch.sigmoid(self.of_action(inputs).unflatten(-1, (self.heads, n)))
-        lambdas = attention.sum(-2)  # [..., agents], not negative
+            one_hot = (actions[..., None] == self.actions).float().flatten(-2)  # [..., agents * actions]
+            action = self.of_action(torch.cat([state, one_hot], -1))
+            attention = attention * torch.sigmoid(action.unflatten(-1, (self.heads, n)))
+        lambdas = attention.sum(-2)  # [..., agents], not negative: no agent gains by a worse advantage
         return (weight * utilities + bias + (lambdas - 1) * advantages).sum(-1)
 
 
 class Batch(NamedTuple):
     """A batch of B windows of up to W decision rows: R rows in all, n agents.
 
-    The agents' own decisions, M entries, are packed as Agents.forward wants them; rows look up their agents' by entry.
+    The agents' own decisions, M entries, are packed as Agents.forward wants them; a row looks up its agents' by entry.
     """
 
     obs: torch.Tensor  # float32 [n, M, d]
@@ -263,8 +263,8 @@ class Batch(NamedTuple):
     next_entry: torch.Tensor  # int64 [R, n], and at the row after it
     chosen: torch.Tensor  # bool [R, n], False for agents that are ongoing at the row
     next_chosen: torch.Tensor  # bool [R, n]
-    state: torch.Tensor  # float32 [R, S], mixer input for the row
-    next_state: torch.Tensor  # float32 [R, S], and for its target
+    state: torch.Tensor  # float32 [R, S], mixer input of the row
+    next_state: torch.Tensor  # float32 [R, S], and of its target
     reward: torch.Tensor  # float32 [R], discounted sum until the next row
     discount: torch.Tensor  # float32 [R], gamma^tau, 0 where the episode terminated
     valid: torch.Tensor  # bool [B, W], where the R rows stand in their windows
@@ -273,67 +273,63 @@ class Batch(NamedTuple):
 class ReplayBuffer:
     """Whole episodes as arrays: each agent's own decisions, and joint decision rows that point at them.
 
-    An agent's macro-history moves only when it chooses, so its macro-observations and macro-actions are stored once per
-    decision. Row k holds, for each agent, the number of its latest decision; `row` of that decision is the row whose state is
-    the agent's macro-state. Episodes are collected in one part of each array (an episode per environment) and copied to the
-    other when they end, so a window can never reach into another episode.
+    A macro-history moves only when its agent chooses, so macro-observations and macro-actions are stored once per
+    decision. Row k holds the number of each agent's latest decision; `row` of that decision is the row whose state is
+    the agent's macro-state. Episodes are collected in `current`, one per environment, and copied to `data` when they
+    end: a window cannot reach into another episode.
+
+    capacity: episodes kept. hidden_size: width of the recurrent states stored with the decisions, 0 for none.
     """
 
-    def __init__(self, env, capacity, num_envs, gamma, mixer_state="joint", hidden_size=0):
-        """capacity: episodes kept. hidden_size: width of stored recurrent states, 0 to store none."""
-        n, rows, d = env.n_agents, env.horizon + 1, env.single_observation_space.shape[1]
-        self.capacity, self.gamma, self.mixer_state = capacity, gamma, mixer_state
-        self.per_decision = {"obs": (np.float32, d), "action": (np.int16,), "row": (np.int16,)}
-        self.per_row = {"decision": (np.int16, n), "state": (np.float32, env.state_size), "reward": (np.float32,)}
-        self.per_row |= {"discount": (np.float32,)}
-        if hidden_size:
-            self.per_decision["hidden"] = (np.float32, hidden_size)
-        if mixer_state == "real":
-            self.per_row["last_state"] = (np.float32, env.state_size)
+    def __init__(self, env, capacity, gamma, mixer_state="joint", hidden_size=0):
+        self.capacity, self.gamma, self.mixer_state, self.hidden_size = capacity, gamma, mixer_state, hidden_size
+        n, rows, real = env.n_agents, env.horizon + 1, env.state_size * (mixer_state == "real")
+        obs_size = env.single_observation_space.shape[1]
+        self.per_decision = {"obs": (obs_size,), "action": (), "row": (), "hidden": (hidden_size,)}
+        self.per_row = {"latest": (n,), "state": (env.state_size,), "last_state": (real,), "reward": (), "discount": ()}
 
         def arrays(episodes):
-            data = {key: np.zeros((episodes, n, rows, *shape), dtype) for key, (dtype, *shape) in self.per_decision.items()}
-            data |= {key: np.zeros((episodes, rows, *shape), dtype) for key, (dtype, *shape) in self.per_row.items()}
+            dtypes = dict.fromkeys(("action", "row", "latest"), np.int16)
+            sizes = {key: (n, rows, *size) for key, size in self.per_decision.items()}
+            sizes |= {key: (rows, *size) for key, size in self.per_row.items()}
+            data = {key: np.zeros((episodes, *size), dtypes.get(key, np.float32)) for key, size in sizes.items()}
             return data | {"decisions": np.zeros((episodes, n), np.int64), "rows": np.zeros(episodes, np.int64)}
 
-        self.current, self.data = arrays(num_envs), arrays(capacity)
-        self.size, self.next = 0, 0
+        self.current, self.data, self.size, self.next = arrays(env.num_envs), arrays(capacity), 0, 0
 
-    def decide(self, free, obs, actions, state, hidden=None):
-        """Notes a decision row wherever an agent is free: bool [N, n], float32 [N, n, d], int [N, n], float32 [N, S]; hidden:
-        recurrent states before the decision, float32 [N, n, H]."""
+    def decide(self, free, obs, actions, state, hidden):
+        """Notes a decision row wherever an agent is free: bool [N, n], float32 [N, n, d], int [N, n], float32 [N, S].
+        hidden: the recurrent states before the decision, float32 [n, N, H]."""
         now = self.current
         env, agent = np.nonzero(free)
         decision = now["decisions"][env, agent]
         now["obs"][env, agent, decision] = obs[env, agent]
         now["action"][env, agent, decision] = actions[env, agent]
         now["row"][env, agent, decision] = now["rows"][env]
-        if "hidden" in now:
-            now["hidden"][env, agent, decision] = hidden[env, agent]
+        if self.hidden_size:
+            now["hidden"][env, agent, decision] = hidden.cpu().numpy()[agent, env]
         now["decisions"] += free
         env = np.flatnonzero(free.any(1))
         row = now["rows"][env]
-        now["decision"][env, row] = now["decisions"][env] - 1
-        now["state"][env, row] = state[env]
+        now["latest"][env, row], now["state"][env, row] = now["decisions"][env] - 1, state[env]
         now["reward"][env, row], now["discount"][env, row] = 0.0, 1.0
         now["rows"][env] += 1
 
     def reward(self, rewards, state):
-        """Adds a step's rewards, float64 [N], to the running rows: r += gamma^t r_t. state: that before the step."""
+        """Adds a step's rewards, float64 [N], to the running rows: r += gamma^t r_t. state: the one before the step."""
         now, env = self.current, np.arange(len(rewards))
         row = now["rows"] - 1
         now["reward"][env, row] += now["discount"][env, row] * rewards
         now["discount"][env, row] *= self.gamma
-        if "last_state" in now:
+        if self.mixer_state == "real":
             now["last_state"][env, row] = state
 
-    def finish(self, over, terminated, obs, state, hidden=None):
+    def finish(self, over, terminated, obs, state, hidden):
         """Ends the episodes in over, bool [N], with their final observation, and moves them to the replay memory."""
         now, env = self.current, np.flatnonzero(over)
-        last = now["rows"][env] - 1
-        now["discount"][env, last] *= ~terminated[env]  # a truncated episode bootstraps
-        everybody = np.repeat(over[:, None], now["decisions"].shape[1], 1)
-        self.decide(everybody, obs, np.zeros_like(everybody, np.int16), state, hidden)
+        now["discount"][env, now["rows"][env] - 1] *= ~terminated[env]  # a truncated episode bootstraps
+        everybody = np.repeat(over[:, None], obs.shape[1], 1)
+        self.decide(everybody, obs, np.zeros(everybody.shape, int), state, hidden)
         slots = (self.next + np.arange(len(env))) % self.capacity
         for key, array in self.data.items():
             array[slots] = now[key][env]
@@ -348,92 +344,87 @@ class ReplayBuffer:
         start = rng.integers(np.maximum(final - window, 0) + 1)
         end = np.minimum(start + window, final)
 
-        # Each agent's own decisions, from its latest one at the first row, which may precede it, to that at the last row
-        first, last = data["decision"][episode, start].astype(int), data["decision"][episode, end]  # [B, agents]
+        # Each agent's own decisions: from its latest one at the first row, which may precede it, to that at the last
+        first, last = data["latest"][episode, start].astype(int), data["latest"][episode, end]  # [B, agents]
         length = last - first + 1
         rank = np.argsort(np.argsort(-length, axis=0, kind="stable"), axis=0)
         alive = np.arange(length.max()) < length[..., None]  # [B, agents, steps]
         sizes = alive.sum(0).max(0)
         offset = np.cumsum(sizes) - sizes
-        b, i, t = np.nonzero(alive)
-        decision, at = first[b, i] + t, (i, offset[t] + rank[b, i])
+        b, agent, step = np.nonzero(alive)
+        decision, at = (episode[b], agent, first[b, agent] + step), (agent, offset[step] + rank[b, agent])
         obs = np.zeros((len(agents), sizes.sum(), data["obs"].shape[-1]), np.float32)
         action, previous = np.zeros(obs.shape[:2], np.int64), np.full(obs.shape[:2], -1)
-        obs[at], action[at] = data["obs"][episode[b], i, decision], data["action"][episode[b], i, decision]
-        previous[at] = np.where(decision > 0, data["action"][episode[b], i, decision - 1], -1)
+        obs[at], action[at] = data["obs"][decision], data["action"][decision]
+        before = data["action"][episode[b], agent, decision[2] - 1]
+        previous[at] = np.where(decision[2] > 0, before, -1)
         hidden = None
-        if "hidden" in data:
-            hidden = np.zeros((len(agents), batch_size, data["hidden"].shape[-1]), np.float32)
+        if self.hidden_size:
+            hidden = np.zeros((len(agents), batch_size, self.hidden_size), np.float32)
             hidden[agents, rank] = data["hidden"][episode[:, None], agents, first]
 
         # The joint rows
         valid = start[:, None] + np.arange(window) < end[:, None]  # [B, W]
         b, k = np.nonzero(valid)  # [R] each
         episode, row = episode[b], start[b] + k
-        decision, next_decision = data["decision"][episode, row], data["decision"][episode, row + 1]  # [R, agents]
-        entry, next_entry = (offset[of - first[b]] + rank[b] for of in (decision, next_decision))
-        own_row = data["row"][episode[:, None], agents, decision]  # [R, agents], where each made its latest decision
-        next_own_row = data["row"][episode[:, None], agents, next_decision]
+        latest, next_latest = data["latest"][episode, row], data["latest"][episode, row + 1]  # [R, agents]
+        entry, next_entry = (offset[of - first[b]] + rank[b] for of in (latest, next_latest))
+        own_row = data["row"][episode[:, None], agents, latest]  # [R, agents], where each made its latest decision
+        next_own_row = data["row"][episode[:, None], agents, next_latest]
         chosen, next_chosen = own_row == row[:, None], next_own_row == row[:, None] + 1
+        next_state = data["state"][episode, row + 1]
         if self.mixer_state == "joint":
             state = data["state"][episode[:, None], own_row].reshape(len(row), -1)  # [R, agents * S]
             next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)
+        elif self.mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
+            state = data["state"][episode, own_row[np.arange(len(row)), next_chosen.argmax(1)]]
         else:
-            next_state = data["state"][episode, row + 1]
-            if self.mixer_state == "single":  # of the first agent whose macro-action ends at the end of the row
-                state = data["state"][episode, own_row[np.arange(len(row)), next_chosen.argmax(1)]]
-            else:
-                state = data["last_state" if self.mixer_state == "real" else "state"][episode, row]
-        reward, discount = data["reward"][episode, row], data["discount"][episode, row]
+            state = data["last_state" if self.mixer_state == "real" else "state"][episode, row]
         batch = Batch(obs, previous, action, hidden, sizes.tolist(), entry, next_entry, chosen, next_chosen, state,
-                      next_state, reward, discount, valid)  # fmt: skip
+                      next_state, data["reward"][episode, row], data["discount"][episode, row], valid)  # fmt: skip
         return Batch(*(torch.from_numpy(x).to(device) if isinstance(x, np.ndarray) else x for x in batch))
 
+    def _parts(self):
+        """(collected or replayed, array's name, array, what of it is filled): all that a checkpoint needs."""
+        for part, data, count in (("current", self.current, len(self.current["rows"])), ("data", self.data, self.size)):
+            yield from ((part, key, data[key][:count], ...) for key in ("rows", "decisions"))  # first: masks need them
+            steps = np.arange(data["row"].shape[2])
+            decisions, rows = steps < data["decisions"][:count, :, None], steps < data["rows"][:count, None]
+            yield from ((part, key, data[key][:count], decisions) for key in self.per_decision)
+            yield from ((part, key, data[key][:count], rows) for key in self.per_row)
+
     def save(self):
-        """The buffer as a dict of tensors without padding, for checkpoints."""
-        saved = {"size": self.size, "next": self.next}
-        for name, data, count in (("current", self.current, None), ("data", self.data, self.size)):
-            masks = self._masks(data, count)
-            saved[name] = {key: torch.from_numpy(array[:count][masks[key]]) for key, array in data.items()}
-        return saved
+        """The buffer as a dict of tensors, for checkpoints."""
+        arrays = {f"{part}/{key}": torch.from_numpy(array[filled]) for part, key, array, filled in self._parts()}
+        return {"size": self.size, "next": self.next, **arrays}
 
     def load(self, saved):
         """Continues from what `save` returned."""
         self.size, self.next = saved["size"], saved["next"]
-        for name, data, count in (("current", self.current, None), ("data", self.data, self.size)):
-            for key in ("decisions", "rows"):  # first: the masks are made of them
-                data[key][:count] = saved[name][key].numpy()
-            for key, mask in self._masks(data, count).items():
-                data[key][:count][mask] = saved[name][key].numpy()
-
-    def _masks(self, data, count):
-        """For each array, where its first `count` episodes hold something."""
-        steps = np.arange(data["row"].shape[2])
-        filled = {key: steps < data["decisions"][:count, :, None] for key in self.per_decision}
-        filled |= {key: steps < data["rows"][:count, None] for key in self.per_row}
-        return filled | {"decisions": ..., "rows": ...}
+        for part, key, array, filled in self._parts():
+            array[filled] = saved[f"{part}/{key}"].numpy()
 
 
-def td_loss(utilities, values, target_utilities, target_values, mixer, target_mixer, batch, td_lambda=0.0, hysteresis=1.0):
-    """The loss of Eq. 14 over the valid rows, with double Q-learning.
+def td_loss(utilities, values, target_utilities, target_values, mixer, target_mixer, batch, td_lambda=0, hysteresis=1):
+    """The loss of Eq. 14 over the rows of a batch, with double Q-learning.
 
     Args:
-        utilities, target_utilities: float32 [n, M, A], and values, target_values: float32 [n, M], of the batch's decisions.
-        mixer, target_mixer: callables (utilities, values, actions, chosen, state) -> joint values [...].
+        utilities, target_utilities: float32 [n, M, A], values, target_values: float32 [n, M], of the batch's decisions.
+        mixer, target_mixer: callables (utilities, values, actions, chosen, state) -> joint values [R].
         td_lambda: 0 for one-row targets, up to 1. hysteresis: factor on negative TD errors, 1 for none.
 
     Returns:
-        the loss (scalar tensor), joint values and targets of the valid rows, float32 [rows] each.
+        the loss (scalar tensor), joint values and targets, float32 [R] each.
     """
-    agents = torch.arange(len(utilities), device=utilities.device)
+    agents, entry, next_entry = torch.arange(len(utilities), device=utilities.device), batch.entry, batch.next_entry
     taken = utilities.gather(2, batch.action[..., None])[..., 0]  # [agents, M]
-    action, later_action = batch.action[agents, batch.entry], batch.action[agents, batch.next_entry]  # [R, agents]
-    q = mixer(taken[agents, batch.entry], values[agents, batch.entry], action, batch.chosen, batch.state)  # [R]
+    action, running = batch.action[agents, entry], batch.action[agents, next_entry]  # [R, agents]
+    q = mixer(taken[agents, entry], values[agents, entry], action, batch.chosen, batch.state)  # [R]
 
     with torch.no_grad():
         # The conditional argmax: agents that choose at the next row take the online network's best, the others go on.
-        best = torch.where(batch.next_chosen, utilities.argmax(2)[agents, batch.next_entry], later_action)
-        next_q, next_v = target_utilities[agents, batch.next_entry, best], target_values[agents, batch.next_entry]
+        best = torch.where(batch.next_chosen, utilities.argmax(2)[agents, next_entry], running)
+        next_q, next_v = target_utilities[agents, next_entry, best], target_values[agents, next_entry]
         bootstrap = target_mixer(next_q, next_v, best, batch.next_chosen, batch.next_state)  # [R]
         target = batch.reward + batch.discount * bootstrap
         if td_lambda > 0:  # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
@@ -450,74 +441,205 @@ def td_loss(utilities, values, target_utilities, target_values, mixer, target_mi
     return torch.where(error < 0, hysteresis * error, error).square().mean(), q, target
 
 
-def act(agents, obs, infos, hidden, epsilon, rng):
+def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
     """Epsilon-greedy macro-actions of the free agents.
 
     Args:
         obs: float32 [N, n, d] and infos of the environment's last reset or step. hidden: float32 [n, N, H].
-        epsilon: exploration rate. rng: NumPy generator, drawn from only if epsilon > 0.
+        epsilon: exploration rate. rng: NumPy generator, needed if epsilon > 0.
 
     Returns:
-        actions int64 [N, n] (running agents': the running one) and the new recurrent states, which move only where an agent
-        is free.
+        actions int64 [N, n] (of ongoing agents the running one), recurrent states that moved where an agent is free.
     """
     free, running = infos["macro_done"], infos["macro_action"]
-    inputs = torch.from_numpy(obs).to(hidden.device).transpose(0, 1)  # [agents, N, d]
-    previous = torch.from_numpy(running).to(hidden.device).T  # [agents, N]
+    by_agent = [torch.from_numpy(x).to(hidden.device).transpose(0, 1) for x in (obs, running, free)]  # [n, N, ...]
     with torch.no_grad():
-        utilities, _, states = agents(inputs, previous, hidden, [len(obs)])
-    moved = torch.from_numpy(free).to(hidden.device).T[..., None]  # [agents, N, 1]
+        utilities, _, states = agents(*by_agent[:2], hidden, [len(obs)])
     actions = utilities.argmax(2).T.cpu().numpy()  # [N, agents]
     if epsilon > 0:
-        n_actions = (~agents.padding).sum((1, 2)).cpu().numpy()
-        draws = rng.random((2, *free.shape))
-        actions = np.where(draws[0] < epsilon, (draws[1] * n_actions).astype(np.int64), actions)
-    return np.where(free, actions, running), torch.where(moved, states, hidden)
+        explore, any_action = rng.random((2, *free.shape))
+        actions = np.where(explore < epsilon, (any_action * agents.n_actions).astype(np.int64), actions)
+    return np.where(free, actions, running), torch.where(by_agent[2][..., None], states, hidden)
 
 
 def evaluate(agents, env, gamma, seed, frames=None):
-    """Greedy returns: the first episode of each environment in a batch.
+    """Greedy play: the first episode of each environment of a batch, reset with the seed.
 
-    Args:
-        env: MacroVectorEnv, reset with the seed. gamma: of the discounted return. frames: a list that receives the pictures
-            of environment 0.
-
-    Returns:
-        a dict of float64 [N]: return, discounted_return, length, success (0 or 1).
+    Returns a dict of float64 [N]: return, discounted_return, length, success (0 or 1). frames: a list that receives the
+    pictures of environment 0.
     """
     obs, infos = env.reset(seed=seed)
-    device = agents.padding.device
-    hidden = torch.zeros(env.n_agents, env.num_envs, agents.hidden_size, device=device)
-    live, discount = np.ones(env.num_envs, bool), 1.0
+    hidden = torch.zeros(env.n_agents, env.num_envs, agents.hidden_size, device=agents.actions.device)
     result = {key: np.zeros(env.num_envs) for key in ("return", "discounted_return", "length", "success")}
+    live, step = np.ones(env.num_envs, bool), 0
+    if frames is not None:
+        frames.append(env.render()[0])
     while live.any():
+        actions, hidden = act(agents, obs, infos, hidden)
+        obs, rewards, terminations, truncations, infos = env.step(actions)
+        result["return"] += live * rewards
+        result["discounted_return"] += live * gamma**step * rewards
+        result["length"] += live
+        result["success"] += live & infos["success"]
         if frames is not None and live[0]:
             frames.append(env.render()[0])
-        actions, hidden = act(agents, obs, infos, hidden, 0.0, None)
-        obs, rewards, terminations, truncations, infos = env.step(actions)
-        result["return"] += rewards * live
-        result["discounted_return"] += discount * rewards * live
-        result["length"] += live
-        over = terminations | truncations
-        result["success"] += infos["success"] & live
-        discount *= gamma
-        if frames is not None and live[0] and over[0]:
-            frames.append(env.render()[0])
+        over, step = terminations | truncations, step + 1
         live &= ~over
-        if over.any() and live.any():  # ended ones run on unheeded
+        if over.any():  # play on in ended environments without looking
             obs, infos = env.reset(options={"reset_mask": over})
-            hidden[:, torch.from_numpy(over).to(device)] = 0.0
+            hidden[:, over] = 0.0
     return result
 
 
 def make_networks(args, env):
-    """Agents and mixer for an environment, on the device, as one module."""
-    width = env.n_agents * env.state_size if args.mixer_state == "joint" else env.state_size
+    """Agents and mixer for an environment, as one module."""
+    width = env.state_size * (env.n_agents if args.mixer_state == "joint" else 1)
     agents = Agents(env.n_actions, env.single_observation_space.shape[1], args.hidden_size, args.advantage == "dueling")
+    joint_action = args.advantage == "max"  # deviation 2
     mixer = QPLEXMixer(
-        env.n_actions, width, args.mixing_embed, args.attention_heads, args.mask_ongoing, args.advantage == "max"
+        env.n_actions, width, args.mixing_embed, mask_ongoing=args.mask_ongoing, joint_action=joint_action
     )
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device)
+
+
+def train(args):
+    """Trains from Args, or goes on with the run args.resume; returns the run folder."""
+    check(args)
+    torch.set_num_threads(args.torch_threads)
+    torch.manual_seed(args.seed)
+    rng = np.random.default_rng(args.seed)
+    env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
+    learner = make_networks(args, env)
+    target = copy.deepcopy(learner).requires_grad_(False)
+    agents, mixer = learner["agents"], learner["mixer"]
+    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
+    stored_hidden = args.hidden_size if args.hidden_state == "stored" else 0
+    buffer = ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state, stored_hidden)
+    if args.resume:
+        folder, saved = Path(args.resume), load_file(args.resume, "checkpoint.pt")
+        for name, part in (("learner", learner), ("target", target), ("optimizer", optimizer)):
+            part.load_state_dict(saved[name])
+        buffer.load(saved["buffer"])
+        obs, infos = env.load_state(saved["env"])
+        hidden, rng.bit_generator.state = saved["hidden"].to(args.device), saved["rng"]
+        step, updates, recent, models = saved["step"], saved["updates"], saved["recent"], saved["models"]
+    else:
+        folder = make_run_folder(args)
+        obs, infos = env.reset(seed=args.seed)
+        hidden = torch.zeros(env.n_agents, args.num_envs, args.hidden_size, device=args.device)
+        step, updates, recent, models = 0, 0, [], {}
+    writer = SummaryWriter(folder, purge_step=step + 1)
+    table = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
+    writer.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}", step)
+
+    def save_checkpoint():
+        saved = {"learner": learner.state_dict(), "target": target.state_dict(), "optimizer": optimizer.state_dict()}
+        arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
+        saved |= {"buffer": buffer.save(), "env": arrays, "hidden": hidden, "rng": rng.bit_generator.state}
+        save(saved | {"step": step, "updates": updates, "recent": recent, "models": models}, folder / "checkpoint.pt")
+
+    # Ctrl-C and a termination signal take effect between two steps, where a checkpoint is whole; a second one at once.
+    stop = []
+
+    def request_stop(number, frame):
+        stop.append(number)
+        signal.signal(number, handlers[number])
+
+    handlers = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=not sys.stderr.isatty(), dynamic_ncols=True)
+    started, first_step = time.time(), step
+    while step < args.total_timesteps and not stop:
+        # Choose and step
+        progress = min(1.0, step / args.exploration_timesteps)
+        epsilon = args.start_e + progress * (args.end_e - args.start_e)
+        actions, moved = act(agents, obs, infos, hidden, epsilon, rng)
+        state = infos["state"]
+        buffer.decide(infos["macro_done"], obs, actions, state, hidden)
+        obs, rewards, terminations, truncations, infos = env.step(actions)
+        buffer.reward(args.reward_scale * rewards, state)
+        hidden, step = moved, step + args.num_envs
+
+        # Store the episodes that ended and start new ones
+        over = terminations | truncations
+        if over.any():
+            buffer.finish(over, terminations, obs, infos["state"], hidden)
+            recent += zip(env.episode_return[over].tolist(), env.elapsed[over].tolist(), strict=True)
+            obs, infos = env.reset(options={"reset_mask": over})
+            hidden[:, over] = 0.0
+
+        # Learn
+        while updates < (step - args.learning_starts) // args.train_frequency and buffer.size:
+            batch = buffer.sample(args.batch_size, args.window, rng, args.device)
+            history = (batch.obs, batch.previous, batch.hidden, batch.sizes)
+            with torch.no_grad():
+                next_q, next_v, _ = target["agents"](*history)
+            q, v, _ = agents(*history)
+            beta = args.hysteresis_start + progress * (args.hysteresis_end - args.hysteresis_start)
+            loss, joint_q, _ = td_loss(q, v, next_q, next_v, mixer, target["mixer"], batch, args.td_lambda, beta)
+            optimizer.zero_grad()
+            loss.backward()
+            grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
+            optimizer.step()
+            for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
+                slow.data.lerp_(fast.data, 1 - args.polyak)
+            updates += 1
+            if updates % 100 == 0:
+                writer.add_scalar("losses/td_loss", loss.item(), step)
+                writer.add_scalar("losses/q_values", joint_q.mean().item(), step)
+                writer.add_scalar("losses/grad_norm", grad_norm.item(), step)
+
+        # Log, evaluate, save
+        due = {f: step // f > (step - args.num_envs) // f or step >= args.total_timesteps
+               for f in (2_000, args.eval_frequency, args.checkpoint_frequency)}  # fmt: skip
+        if due[2_000] and recent:
+            sps, (mean_return, mean_length) = (step - first_step) / (time.time() - started), np.mean(recent, 0)
+            for key, value in (("SPS", sps), ("epsilon", epsilon), ("episodic_return", mean_return)):
+                writer.add_scalar(f"charts/{key}", value, step)
+            writer.add_scalar("charts/episodic_length", mean_length, step)
+            bar.update(step - bar.n)
+            bar.set_postfix_str(f"return {mean_return:.1f}, epsilon {epsilon:.2f}, {sps:.0f} steps/s")
+            recent = []
+        if due[args.eval_frequency]:
+            eval_seed = int(np.random.SeedSequence([args.seed, step]).generate_state(1)[0])
+            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, eval_seed).items()}
+            for key, value in result.items():
+                writer.add_scalar(f"eval/{key}", value, step)
+            model = {"step": step, "return": result["return"], "networks": copy.deepcopy(learner.state_dict())}
+            models = {"last": model, "best": max(models.get("best", model), model, key=lambda m: m["return"])}
+            save(models, folder / "model.pt")
+            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
+        if due[args.checkpoint_frequency]:
+            save_checkpoint()
+
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    bar.close()
+    writer.close()
+    if stop:
+        save_checkpoint()
+        print(f"stopped at step {step}; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
+    return folder
+
+
+def report(args):
+    """Evaluates the model of the run folder args.evaluate, prints the result and writes the animation args.gif."""
+    check(args)
+    torch.set_num_threads(args.torch_threads)
+    env = envs.make(args.env, args.eval_episodes, render_mode="rgb_array" if args.gif else None)
+    learner, model = make_networks(args, env), load_file(args.evaluate, "model.pt")[args.model]
+    learner.load_state_dict(model["networks"])
+    frames = [] if args.gif else None
+    result = evaluate(learner["agents"], env, args.gamma, args.seed, frames)
+    print(f"{args.env} {ALGORITHM} {args.model} model of step {model['step']}: {args.eval_episodes} greedy episodes")
+    for key, value in result.items():
+        error = value.std(ddof=1) / len(value) ** 0.5 if len(value) > 1 else float("nan")
+        print(f"{key.replace('_', ' '):17s} {value.mean():9.3f} +- {error:.3f} (standard error)")
+    if args.gif:
+        pictures = [Image.fromarray(frame).quantize(64) for frame in frames]
+        try:
+            pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], duration=150, loop=0)
+        except (OSError, ValueError) as error:
+            fail(f"cannot write {args.gif}: {error}")
 
 
 def fail(message):
@@ -529,188 +651,53 @@ def check(args):
     """Ends the program with one line if an argument is out of range."""
     if args.env not in envs.IDS:
         fail(f"unknown --env {args.env!r}; valid ids: {' '.join(envs.IDS)}")
-    at_least = {
-        1: "total_timesteps num_envs eval_frequency eval_episodes checkpoint_frequency torch_threads buffer_size batch_size "
-        "window exploration_timesteps train_frequency hidden_size mixing_embed attention_heads",
-        0: "seed learning_starts learning_rate max_grad_norm reward_scale gamma polyak start_e end_e td_lambda "
-        "hysteresis_start hysteresis_end",
-    }
-    for low, names in at_least.items():
-        for name in names.split():
-            if not getattr(args, name) >= low:
-                fail(f"--{name.replace('_', '-')} must be at least {low}, got {getattr(args, name)}")
-    for name in "gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end".split():
-        if getattr(args, name) > 1:
-            fail(f"--{name.replace('_', '-')} must be at most 1, got {getattr(args, name)}")
+    zero_to_one = "gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end".split()
+    from_zero = ["seed", "learning_starts", "learning_rate", "max_grad_norm", "reward_scale"]
+    for field in fields(args):
+        value, name = getattr(args, field.name), "--" + field.name.replace("_", "-")
+        if field.name in zero_to_one and not 0 <= value <= 1:
+            fail(f"{name} must be between 0 and 1, got {value}")
+        if field.name in from_zero and not 0 <= value < float("inf"):
+            fail(f"{name} must not be negative, got {value}")
+        if type(value) is int and field.name not in from_zero and value < 1:
+            fail(f"{name} must be at least 1, got {value}")
     try:
         torch.zeros(1, device=args.device)
     except (RuntimeError, AssertionError) as error:
         fail(f"--device {args.device} is not available: {str(error).splitlines()[0]}")
 
 
-def save_atomically(saved, path):
-    """Writes beside the file and swaps, so that a kill at any moment leaves the old or the new one whole."""
+def save(saved, path):
+    """Writes beside the file and swaps, so that a kill at any moment leaves the old one or the new one."""
     torch.save(saved, f"{path}.new")
     os.replace(f"{path}.new", path)
 
 
 def load_file(folder, name):
-    """A dict saved in a run folder, on the CPU."""
+    """What `save` wrote in a run folder, on the CPU."""
     try:
         return torch.load(Path(folder) / name, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         fail(f"there is no {name} in {folder}")
-    except Exception as error:
-        fail(f"{Path(folder) / name} cannot be read: {str(error).splitlines()[0]}")
+    except Exception as error:  # torch names no common class for what a damaged file raises
+        fail(f"{Path(folder) / name} is damaged: {str(error).splitlines()[0]}")
 
 
 def make_run_folder(args):
-    """A new folder runs_dir/<env>__<script>__<seed>__<time>, never one that exists."""
-    stem, suffix = f"{args.env}__{ALGORITHM}__{args.seed}__{int(time.time())}", 0
-    while True:
-        folder = Path(args.runs_dir) / (f"{stem}-{suffix}" if suffix else stem)
-        try:
-            folder.mkdir(parents=True)
-            (folder / "args.json").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2) + "\n")
-            return folder
-        except FileExistsError as error:
-            if not folder.is_dir():
-                fail(f"cannot make the run folder {folder}: {error.strerror}")
-            suffix += 1
-        except OSError as error:
-            fail(f"cannot make the run folder {folder}: {error.strerror}")
-
-
-def train(args):
-    """Trains from Args, or goes on from args.resume, and returns the run folder."""
-    check(args)
-    torch.set_num_threads(args.torch_threads)
-    torch.manual_seed(args.seed)
-    rng = np.random.default_rng(args.seed)
-    env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
-    learner = make_networks(args, env)
-    target = copy.deepcopy(learner).requires_grad_(False)
-    agents, mixer = learner["agents"], learner["mixer"]
-    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
-    stored = args.hidden_size if args.hidden_state == "stored" else 0
-    buffer = ReplayBuffer(env, args.buffer_size, args.num_envs, args.gamma, args.mixer_state, stored)
-
-    step, updates, recent, models = 0, 0, [], {}
-    if args.resume:
-        folder, saved = Path(args.resume), load_file(args.resume, "checkpoint.pt")
-        obs, infos = env.load_state(saved["env"])
-        learner.load_state_dict(saved["learner"])
-        target.load_state_dict(saved["target"])
-        optimizer.load_state_dict(saved["optimizer"])
-        buffer.load(saved["buffer"])
-        hidden = saved["hidden"].to(args.device)
-        rng.bit_generator.state = saved["rng"]
-        step, updates, recent, models = saved["step"], saved["updates"], saved["recent"], saved["models"]
-    else:
-        folder = make_run_folder(args)
-        obs, infos = env.reset(seed=args.seed)
-        hidden = torch.zeros(env.n_agents, args.num_envs, args.hidden_size, device=args.device)
-    writer = SummaryWriter(folder, purge_step=step + 1)
-    if not args.resume:
-        writer.add_text("hyperparameters", "|name|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()))
-
-    def save_checkpoint():
-        arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
-        saved = dict(learner=learner.state_dict(), target=target.state_dict(), optimizer=optimizer.state_dict(), env=arrays)
-        saved |= dict(buffer=buffer.save(), hidden=hidden, rng=rng.bit_generator.state, models=models, recent=recent)
-        save_atomically(saved | dict(step=step, updates=updates), folder / "checkpoint.pt")
-
-    # Ctrl-C or a termination signal takes effect between two steps, where a checkpoint is whole; a second one at once.
-    stop = []
-
-    def request_stop(number, frame):
-        stop.append(number)
-        signal.signal(number, previous_handlers[number])
-
-    previous_handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number in previous_handlers:
-        signal.signal(number, request_stop)
-
-    bar = tqdm(total=args.total_timesteps, initial=step, unit="step", disable=not sys.stderr.isatty(), dynamic_ncols=True)
-    started, first_step = time.time(), step
-    while step < args.total_timesteps and not stop:
-        # Choose and step
-        progress = min(1.0, step / args.exploration_timesteps)
-        epsilon = args.start_e + progress * (args.end_e - args.start_e)
-        state, hidden_before = infos["state"], hidden
-        actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
-        if stored:
-            buffer.decide(infos["macro_done"], obs, actions, state, hidden_before.transpose(0, 1).cpu().numpy())
-        else:
-            buffer.decide(infos["macro_done"], obs, actions, state)
-        obs, rewards, terminations, truncations, infos = env.step(actions)
-        buffer.reward(args.reward_scale * rewards, state)
-        step += args.num_envs
-
-        # Store episodes that ended, start new ones
-        over = terminations | truncations
-        if over.any():
-            buffer.finish(over, terminations, obs, infos["state"], hidden.transpose(0, 1).cpu().numpy() if stored else None)
-            recent += zip(env.episode_return[over].tolist(), env.elapsed[over].tolist(), strict=True)
-            obs, infos = env.reset(options={"reset_mask": over})
-            hidden[:, torch.from_numpy(over).to(args.device)] = 0.0
-
-        # Learn
-        while updates < (step - args.learning_starts) // args.train_frequency and buffer.size:
-            batch = buffer.sample(args.batch_size, args.window, rng, args.device)
-            with torch.no_grad():
-                next_q, next_v, _ = target["agents"](batch.obs, batch.previous, batch.hidden, batch.sizes)
-            q, v, _ = agents(batch.obs, batch.previous, batch.hidden, batch.sizes)
-            beta = args.hysteresis_start + progress * (args.hysteresis_end - args.hysteresis_start)
-            loss, joint_q, _ = td_loss(q, v, next_q, next_v, mixer, target["mixer"], batch, args.td_lambda, beta)
-            optimizer.zero_grad()
-            loss.backward()
-            grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
-            optimizer.step()
-            with torch.no_grad():
-                for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
-                    slow.lerp_(fast, 1 - args.polyak)
-            updates += 1
-            if updates % 100 == 0:
-                writer.add_scalar("losses/td_loss", loss.item(), step)
-                writer.add_scalar("losses/q_values", joint_q.mean().item(), step)
-                writer.add_scalar("losses/grad_norm", grad_norm.item(), step)
-
-        # Log, evaluate, save
-        def due(frequency, step=step):
-            return step // frequency > (step - args.num_envs) // frequency or step >= args.total_timesteps
-
-        if due(2_000):
-            sps = (step - first_step) / (time.time() - started)
-            writer.add_scalar("charts/SPS", sps, step)
-            writer.add_scalar("charts/epsilon", epsilon, step)
-            bar.update(step - bar.n)
-            bar.set_postfix(epsilon=f"{epsilon:.2f}", sps=f"{sps:.0f}", refresh=False)
-            if recent:
-                mean_return, mean_length = np.mean(recent, 0)
-                writer.add_scalar("charts/episodic_return", mean_return, step)
-                writer.add_scalar("charts/episodic_length", mean_length, step)
-                bar.set_postfix_str(f"return={mean_return:.1f}, {bar.postfix}", refresh=False)
-                recent = []
-        if due(args.eval_frequency):
-            eval_seed = int(np.random.SeedSequence([args.seed, step]).generate_state(1)[0])
-            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, eval_seed).items()}
-            for key, value in result.items():
-                writer.add_scalar(f"eval/{key}", value, step)
-            model = {"step": step, "return": result["return"], "networks": copy.deepcopy(learner.state_dict())}
-            models = {"last": model, "best": max(models.get("best", model), model, key=lambda m: m["return"])}
-            save_atomically(models, folder / "model.pt")
-            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", file=sys.stderr)
-        if due(args.checkpoint_frequency):
-            save_checkpoint()
-
-    for number, handler in previous_handlers.items():
-        signal.signal(number, handler)
-    bar.close()
-    save_checkpoint()
-    writer.close()
-    if stop:
-        print(f"stopped at step {step}; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
+    """Makes runs_dir/<env>__<script>__<seed>__<time>, a new folder for each run, with args.json in it."""
+    stem, tries = f"{args.env}__{ALGORITHM}__{args.seed}__{int(time.time())}", 0
+    try:
+        Path(args.runs_dir).mkdir(parents=True, exist_ok=True)
+        while True:
+            folder = Path(args.runs_dir) / (f"{stem}-{tries}" if tries else stem)
+            try:
+                folder.mkdir()
+                break
+            except FileExistsError:  # another run of the same second
+                tries += 1
+        (folder / "args.json").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2) + "\n")
+    except OSError as error:
+        fail(f"cannot write to --runs-dir {args.runs_dir}: {error.strerror}")
     return folder
 
 
@@ -718,17 +705,16 @@ def load_args(folder):
     """The Args of a run folder."""
     try:
         saved = json.loads((Path(folder) / "args.json").read_text())
-    except OSError as error:
-        fail(f"{folder} is not a run folder: args.json: {error.strerror}")
-    except json.JSONDecodeError:
-        fail(f"{folder} is not a run folder: its args.json is damaged")
-    if saved.pop("algorithm", None) != ALGORITHM:
-        fail(f"{folder} is a run of another algorithm, not of {ALGORITHM}")
-    return Args(**{field.name: saved[field.name] for field in fields(Args) if field.name in saved})
+        algorithm = saved.pop("algorithm")
+        if algorithm != ALGORITHM:
+            fail(f"{folder} is a run of {algorithm}, not of {ALGORITHM}")
+        return Args(**saved)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        fail(f"{folder} is not a run folder: args.json: {error}")
 
 
 def parse_args(argv=None):
-    """Args from the command line; defaults are those of the environment family, or of the run folder that is continued."""
+    """Args from the command line, over the defaults of the environment family or the settings of the run continued."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in ("--env", "--resume", "--evaluate"):
         peek.add_argument(flag)
@@ -736,36 +722,14 @@ def parse_args(argv=None):
     folder = known.resume or known.evaluate
     base = load_args(folder) if folder else defaults(known.env or Args.env)
     args = tyro.cli(Args, default=base, args=argv)
-    free = {"resume", "evaluate", "device", "torch_threads"}
-    free |= {"eval_episodes", "gif", "model", "seed"} if known.evaluate else {"total_timesteps", "checkpoint_frequency"}
+    may_change = {"resume", "evaluate", "device", "torch_threads"}
+    evaluation, training = {"eval_episodes", "gif", "model", "seed"}, {"total_timesteps", "checkpoint_frequency"}
+    may_change |= evaluation if args.evaluate else training
     for field in fields(Args):
-        if folder and field.name not in free and getattr(args, field.name) != getattr(base, field.name):
-            fail(f"--{field.name.replace('_', '-')} cannot change: {folder} has {getattr(base, field.name)}")
+        old, new = getattr(base, field.name), getattr(args, field.name)
+        if folder and old != new and field.name not in may_change:
+            fail(f"--{field.name.replace('_', '-')} {new} does not fit: {folder} is a run with {old}")
     return args
-
-
-def report(args):
-    """Evaluates the model of a run folder, prints the result and writes the animation."""
-    check(args)
-    torch.set_num_threads(args.torch_threads)
-    env = envs.make(args.env, args.eval_episodes, render_mode="rgb_array" if args.gif else None)
-    learner = make_networks(args, env)
-    model = load_file(args.evaluate, "model.pt")[args.model]
-    learner.load_state_dict(model["networks"])
-    frames = [] if args.gif else None
-    result = evaluate(learner["agents"], env, args.gamma, args.seed, frames)
-    n = args.eval_episodes
-    print(f"{args.env}, {ALGORITHM}, {args.model} model (step {model['step']}), {n} greedy episodes from seed {args.seed}")
-    for key, value in result.items():
-        error = value.std(ddof=1) / n**0.5 if n > 1 else float("nan")
-        print(f"{key.replace('_', ' '):18s}{value.mean():10.3f} +- {error:.3f} (standard error)")
-    if args.gif:
-        try:
-            pictures = [Image.fromarray(frame).quantize(64) for frame in frames]
-            pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], duration=1000 // 6, loop=0)
-        except (OSError, ValueError) as error:
-            fail(f"cannot write {args.gif}: {error}")
-        print(f"wrote {args.gif}: {len(frames)} frames")
 
 
 def main():

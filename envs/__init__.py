@@ -1,7 +1,7 @@
 """The benchmark tasks of asynchronous multi-agent reinforcement learning, batched in NumPy.
 
-`make("wtd-s", num_envs=32)` gives a `MacroVectorEnv`; importing the package also registers every id with Gymnasium, so that
-`gymnasium.make("wtd-s-v0")` gives one environment and `gymnasium.make_vec("wtd-s-v0", num_envs=32)` the batch.
+`make("wtd-s", num_envs=32)` gives a `MacroVectorEnv`; importing the package also registers every id with Gymnasium, so
+that `gymnasium.make("wtd-s-v0")` gives one environment and `gymnasium.make_vec("wtd-s-v0", num_envs=32)` the batch.
 """
 
 import difflib

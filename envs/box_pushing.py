@@ -7,7 +7,7 @@ from envs.core import MacroVectorEnv
 # Orientations 0 N, 1 E, 2 S, 3 W and the step forward in each, x to the east and y to the north.
 NORTH = 0
 FORWARD = np.array([(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)])
-TURN_COST = np.array([np.roll([0.0, 0.1, 0.2, 0.1], orientation) for orientation in range(4)])  # [orientation, direction]
+TURN_COST = np.array([np.roll([0.0, 0.1, 0.2, 0.1], turned) for turned in range(4)])  # [orientation, direction]
 GO_TO, PUSH, TURN_LEFT, TURN_RIGHT = range(4), 4, 5, 6
 WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT = 2, 3
 PRIMITIVE_TO_MACRO = np.array([PUSH, TURN_LEFT, TURN_RIGHT, 7])
@@ -17,38 +17,40 @@ class BoxPushing(MacroVectorEnv):
     """Two agents push boxes to the north wall of a `grid` x `grid` world (`bp-10`, `bp-20`, `bp-30`).
 
     ## Description
-    Either agent can push a small box alone; the big box, two cells wide, moves only when both push it at once. Positions
-    are cell centres (0.5, 1.5, ...), x to the east, y to the north. Agents do not block each other.
+    Either agent can push a small box alone; the big box, two cells wide, moves only when both push it at once.
+    Positions are cell centres (0.5, 1.5, ...), x to the east, y to the north. Agents do not block each other.
 
     ## Macro-actions
-    0, 1 Go-to-Small-Box(0, 1), 2, 3 Go-to-Big-Box(left, right): walk to the cell below the box and face it. 4 Push: walk
-    forward until a wall, or with a small box to the goal row; bumping into the big box, or into any box from the side,
-    costs a penalty and ends it. If both agents start Push in the same step, both facing north, and the last waypoints they
-    reached are 2 and 3, they push the big box together to the goal row (the last waypoint, not the position, is what
+    0, 1 Go-to-Small-Box(0, 1), 2, 3 Go-to-Big-Box(left, right): walk to the cell below the box and face it. 4 Push:
+    walk forward until a wall, or with a small box to the goal row; bumping into the big box, or into any box from the
+    side, costs a penalty and ends it. If both agents start Push in the same step, both facing north, and the last
+    waypoints they reached are 2 and 3, they push the big box together to the goal row (the last waypoint, not the
+    position, is what
     counts: a quirk of the published benchmark, kept). 5 Turn-left, 6 Turn-right, 7 Stay last one step.
-    `primitive=True`: 0 forward, 1 turn left, 2 turn right, 3 stay; the big box moves while both agents stand below its two
-    cells, face north and move forward together.
+    `primitive=True`: 0 forward, 1 turn left, 2 turn right, 3 stay; the big box moves while both agents stand below its
+    two cells, face north and move forward together.
 
     ## Macro-observations
     Five bits about the cell in front: small box, big box, empty, boundary, teammate. At a reset: empty.
 
     ## Rewards
-    `step_cost` every step (the published benchmark has it, the paper does not mention it), `penalty` for each agent that
-    walks into a wall or bumps into a box it cannot move, `small_reward` for each small box on the goal row and
+    `step_cost` every step (the published benchmark has it, the paper does not mention it), `penalty` for each agent
+    that walks into a wall or bumps into a box it cannot move, `small_reward` for each small box on the goal row and
     `big_reward` for the big one.
 
     ## Episode end
     Terminated when any box stands on the goal row (`success`: the big one); truncated after `horizon` steps.
 
     ## State (27 numbers)
-    0-11 for each agent x/grid, y/grid and its orientation one-hot (4); 12-17 for each box (small 0, small 1, big) x/grid,
-    y/grid; 18-25 for each agent the last waypoint it reached, one-hot (4, all 0 before the first); 26 whether the two are
-    pushing the big box. The last nine are not in the benchmark's state: without them it would not be Markov.
+    0-11 for each agent x/grid, y/grid and its orientation one-hot (4); 12-17 for each box (small 0, small 1, big)
+    x/grid, y/grid; 18-25 for each agent the last waypoint it reached, one-hot (4, all 0 before the first); 26 whether
+    the two are pushing the big box. The last nine are not in the benchmark's state: without them it would not be
+    Markov.
 
     ## Arguments
-    grid: even, at least 6. primitive: the primitive-action version. horizon, big_reward, small_reward, penalty, step_cost:
-    as above. agent_starts, agent_orientations, small_boxes, big_box: the layout, cell centres (the big box: the middle of
-    its two cells); None for the published one. The waypoints are the cells below the boxes.
+    grid: even, at least 6. primitive: the primitive-action version. horizon, big_reward, small_reward, penalty,
+    step_cost: as above. agent_starts, agent_orientations, small_boxes, big_box: the layout, cell centres (the big box:
+    the middle of its two cells); None for the published one. The waypoints are the cells below the boxes.
 
     ## Simulator arrays
     position float64 [N, 2, 2], orientation int64 [N, 2], box_y float64 [N, 3] (boxes only ever move north),
@@ -98,10 +100,12 @@ class BoxPushing(MacroVectorEnv):
         self._cell_box = np.array([0, 1, 2, 2])
         self.waypoints = np.stack([self.cell_x, self._boxes[self._cell_box, 1] - 1.0], axis=1)  # [4, (x, y)]
         cells = np.concatenate([self._starts, self.waypoints, np.stack([self.cell_x, self.waypoints[:, 1] + 1], 1)])
-        if (cells % 1 != 0.5).any() or (cells < 0).any() or (cells > grid).any() or (self._boxes[:, 1] >= self.goal_y).any():
-            raise ValueError("agents, boxes and the cells below the boxes must be cell centres inside the grid, below the goal row")
+        if (cells % 1 != 0.5).any() or (cells < 0).any() or (cells > grid).any():
+            raise ValueError("agents, boxes and the cells below the boxes must be cell centres inside the grid")
+        if (self._boxes[:, 1] >= self.goal_y).any():
+            raise ValueError("boxes must start below the goal row")
 
-        self._box_column = np.isin(np.arange(grid + 1) + 0.5, self.cell_x)  # by floor(x), one more for x beyond the wall
+        self._box_column = np.isin(np.arange(grid + 1) + 0.5, self.cell_x)  # by floor(x), one more beyond the wall
 
         self.position, self.orientation = np.zeros((num_envs, 2, 2)), np.zeros((num_envs, 2), np.int64)
         self.box_y = np.zeros((num_envs, 3))
@@ -117,8 +121,8 @@ class BoxPushing(MacroVectorEnv):
         self._lock_onto_big_box(action)
         locked = self.pushing_big[:, None]
         ended = (action >= TURN_LEFT) | self.primitive
-        # Agents act in turn. Go-to reads boxes and Push moves them, and an agent does one of the two: so agent 0's push,
-        # both walks, agent 1's push have the same outcome as agent 0, then agent 1.
+        # Agents act in turn. Go-to reads boxes, Push moves them, and an agent does one of the two: agent 0's push, both
+        # walks, agent 1's push have the same outcome as agent 0, then agent 1.
         push = (action == PUSH) & ~locked
         penalties = self._push(0, push[:, 0], ended)
         if not self.primitive:
@@ -163,7 +167,7 @@ class BoxPushing(MacroVectorEnv):
         return (front[..., :1] == self.cell_x) & (front[..., 1:] == cell_y)
 
     def _push(self, agent, push, ended):
-        """Push (or primitive forward) of one agent where `push`; marks what ended and returns the penalties, float [N]."""
+        """Push (or primitive forward) of one agent where `push`; marks what ended, returns the penalties, float [N]."""
         step = FORWARD[self.orientation[:, agent]]  # [N, (x, y)]
         front = self.position[:, agent] + step
         at_wall = self._outside(front)

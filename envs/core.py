@@ -11,10 +11,11 @@ from gymnasium.vector.utils import batch_space
 class MacroVectorEnv(VectorEnv, ABC):
     """A batch of cooperative environments whose agents run macro-actions of different lengths.
 
-    One step is one primitive time step. An agent whose last macro-action has ended starts the one it is given; the entry
-    of an agent whose macro-action is still running is ignored. A macro-observation changes only in the step in which its
-    agent's macro-action ends. The end of an episode ends every macro-action, so the final observation is everybody's.
-    Environments are not reset by themselves (`AutoresetMode.DISABLED`): pass `options={"reset_mask": terminated | truncated}`.
+    One step is one primitive time step. An agent whose last macro-action has ended starts the one it is given; the
+    entry of an agent whose macro-action is still running is ignored. A macro-observation changes only in the step in
+    which its agent's macro-action ends. The end of an episode ends every macro-action, so the final observation is
+    everybody's. Environments are not reset by themselves (`AutoresetMode.DISABLED`): pass `options={"reset_mask":
+    terminated | truncated}`.
 
     Attributes:
         num_envs: number of environments N.
@@ -28,14 +29,14 @@ class MacroVectorEnv(VectorEnv, ABC):
         macro_action: int64 [N, n], the macro-action running or last run, -1 before the first.
         elapsed: int64 [N], steps taken in the episode. episode_return: float64 [N], its undiscounted return so far.
 
-    A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`; it names the
-    arrays that hold its simulator state in `sim_arrays`, the first axis of each being the environment.
+    A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`; it names
+    the arrays that hold its simulator state in `sim_arrays`, the first axis of each being the environment.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8, "autoreset_mode": AutoresetMode.DISABLED}
     sim_arrays: tuple[str, ...] = ()
 
-    def __init__(self, num_envs, macro_action_names, obs_low, obs_high, obs_sizes, state_size, horizon, render_mode=None):
+    def __init__(self, num_envs, macro_action_names, obs_low, obs_high, obs_sizes, state_size, horizon, render_mode):
         """Args:
         num_envs: N >= 1. macro_action_names: a list of names for each agent. obs_low, obs_high: bounds [n, d].
         obs_sizes: n ints <= d. state_size: S. horizon: >= 1 steps. render_mode: None or "rgb_array".
@@ -75,7 +76,8 @@ class MacroVectorEnv(VectorEnv, ABC):
         """One step of `macro_action`, started in this step where `macro_done`.
 
         Returns:
-            rewards float64 [N], terminations bool [N], ended bool [N, n] (macro-actions that end now), success bool [N].
+            rewards float64 [N], terminations bool [N], ended bool [N, n] (macro-actions that end now), success bool
+            [N].
         """
 
     @abstractmethod
@@ -193,7 +195,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         """
         for name in self._checkpointed():
             if name not in saved or np.shape(saved[name]) != getattr(self, name).shape:
-                raise ValueError(f"the saved state does not fit this environment: {name!r} is missing or of another shape")
+                raise ValueError(f"the saved state is of another environment: {name!r} is missing or of another shape")
         for name in self._checkpointed():
             setattr(self, name, np.array(saved[name]))
         self.np_random.bit_generator.state = saved["np_random"]

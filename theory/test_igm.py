@@ -29,7 +29,7 @@ NUMBERS = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False),
 )
 FORMS = ("free", "equal rows", "additive", "additive but one", "maximum at the greedy tuple")
-MANY, SOME = settings(deadline=None, max_examples=300), settings(deadline=None, max_examples=60)
+MANY, SOME = settings(deadline=None, max_examples=200), settings(deadline=None, max_examples=60)
 
 
 @st.composite

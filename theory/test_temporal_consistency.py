@@ -173,6 +173,13 @@ def test_macro_state_of_an_agent_that_chose_is_the_decision_state(shows):
         assert {s for s, chose in zip(row.macro_states, row.chosen, strict=True) if chose} == {row.state}
 
 
+def test_macro_state_of_the_agent_that_ends_can_be_worse_than_the_real_state():
+    """In mean squared error: worse if the mixer sees m only, better if it sees who chose; exact in neither."""
+    process = delivery("position")
+    ends, real = ({v: value_error(process, name, v) for v in VIEWS} for name in ("single_ends", "real"))
+    assert ends["actions"] > real["actions"] and 0 < ends["chosen"] < real["chosen"]
+
+
 def test_temporal_inconsistency_does_no_harm_by_itself():
     """The decision state is of another date than the ongoing agents' histories, and still determines every value."""
     process = delivery("position")

@@ -1,0 +1,11 @@
+"""Reading back what a run logged."""
+
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+
+def scalars(folder):
+    """{tag: [(step, value), ...]} of a run folder, without the one that depends on the clock."""
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    tags = sorted(set(events.Tags()["scalars"]) - {"charts/SPS"})
+    return {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in tags}

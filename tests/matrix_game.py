@@ -1,0 +1,41 @@
+"""A two-agent matrix game whose macro-actions have different lengths, for tests of what a learner can represent."""
+
+import numpy as np
+
+from envs import MacroVectorEnv
+
+NON_MONOTONIC = np.array([(8.0, -12.0, -12.0), (-12.0, 0.0, 0.0), (-12.0, 0.0, 0.0)])  # Son et al. 2019
+
+
+class MatrixGame(MacroVectorEnv):
+    """Both agents choose at the reset and are paid `payoff[m_0, m_1]` three steps later, which ends the episode.
+
+    Agent 0's macro-actions last one step and agent 1's three: agent 0 chooses twice more, to no effect, while agent 1's
+    choice is ongoing. The state tells the step.
+    """
+
+    sim_arrays = ("first_choice",)
+
+    def __init__(self, num_envs=1, payoff=NON_MONOTONIC, render_mode=None):
+        names = [["a", "b", "c"]] * 2
+        super().__init__(num_envs, names, np.zeros((2, 3)), np.ones((2, 3)), (3, 3), 3, 10, render_mode)
+        self.payoff, self.first_choice = payoff, np.zeros((num_envs, 2), int)
+
+    def _reset(self, mask):
+        self.first_choice[mask] = 0
+
+    def _advance(self):
+        first, last = self.elapsed == 1, self.elapsed == 3
+        self.first_choice[first] = self.macro_action[first]
+        rewards = np.where(last, self.payoff[tuple(self.first_choice.T)], 0.0)
+        ended = np.stack([np.ones(self.num_envs, bool), last], axis=1)
+        return rewards, last, ended, last & (rewards == self.payoff.max())
+
+    def _observe(self, start):
+        return np.repeat(self._state()[:, None], 2, 1)
+
+    def _state(self):
+        return np.eye(4, dtype=np.float32)[np.minimum(self.elapsed, 3), :3]
+
+    def _draw(self, index):
+        raise NotImplementedError

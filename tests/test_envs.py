@@ -1,0 +1,244 @@
+"""The step contract, for every task."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import envs
+
+every_task = pytest.mark.parametrize("env_id", envs.IDS)
+
+
+def play(env, steps, seed, action_seed=0):
+    """Random macro-actions; returns what every step gave, with the environments that ended reset."""
+    rng, history = np.random.default_rng(action_seed), []
+    history.append(env.reset(seed=seed))
+    for _ in range(steps):
+        actions = rng.integers(0, env.n_actions, (env.num_envs, env.n_agents))
+        history.append(env.step(actions))
+        over = history[-1][2] | history[-1][3]
+        if over.any():
+            history.append(env.reset(options={"reset_mask": over}))
+    return history
+
+
+def assert_same(first, second):
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        first, second = list(first.values()), list(second.values())
+    if isinstance(first, (list, tuple)):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    else:
+        np.testing.assert_array_equal(first, second)
+
+
+@every_task
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**31), num_envs=st.integers(1, 5), stay_away=st.booleans())
+def test_step_contract(env_id, seed, num_envs, stay_away):
+    """Random actions never crash, never leave the spaces and keep the promises of MacroVectorEnv."""
+    env, rng = envs.make(env_id, num_envs), np.random.default_rng(seed)
+    obs, infos = env.reset(seed=seed)
+    elapsed, returns = np.zeros(num_envs, int), np.zeros(num_envs)
+    assert infos["macro_done"].all() and (infos["macro_action"] == -1).all()
+    for _ in range(env.horizon + 20):
+        free, before, running = infos["macro_done"], obs.copy(), infos["macro_action"]
+        actions = rng.integers(0, env.n_actions, (num_envs, env.n_agents))
+        actions[~free] = 99 if stay_away else -7  # entries of ongoing agents are ignored, whatever they are
+        obs, rewards, terminations, truncations, infos = env.step(actions)
+        elapsed, returns = elapsed + 1, returns + rewards
+        over = terminations | truncations
+        assert obs in env.observation_space and obs.dtype == np.float32 and obs.shape == env.observation_space.shape
+        assert rewards.dtype == np.float64 and rewards.shape == (num_envs,) and np.isfinite(rewards).all()
+        assert terminations.dtype == bool and truncations.dtype == bool and not (terminations & truncations).any()
+        np.testing.assert_array_equal(truncations, (elapsed == env.horizon) & ~terminations)
+        np.testing.assert_array_equal(infos["macro_action"], np.where(free, actions, running))
+        assert infos["state"].shape == (num_envs, env.state_size) and infos["state"].dtype == np.float32
+        assert np.isfinite(infos["state"]).all()
+        assert infos["macro_done"][over].all(), "the end of an episode ends every macro-action"
+        ongoing = ~infos["macro_done"]
+        np.testing.assert_array_equal(obs[ongoing], before[ongoing])
+        if "primitive" in env_id:
+            assert infos["macro_done"].all()
+        for agent, size in enumerate(env.obs_sizes):
+            assert not obs[:, agent, size:].any(), "padding is 0"
+        np.testing.assert_allclose(env.episode_return, returns)
+        if over.any():
+            kept = obs[~over].copy()
+            obs, infos = env.reset(options={"reset_mask": over})
+            np.testing.assert_array_equal(obs[~over], kept)
+            assert infos["macro_done"][over].all() and (infos["macro_action"][over] == -1).all()
+            elapsed[over], returns[over] = 0, 0.0
+
+
+@every_task
+def test_every_macro_action_ends(env_id):
+    """No macro-action outlives the episode, and names, sizes and spaces agree."""
+    env = envs.make(env_id, 3)
+    assert [len(names) for names in env.macro_action_names] == env.n_actions
+    assert env.single_observation_space.shape == (env.n_agents, max(env.obs_sizes))
+    assert env.single_action_space.nvec.tolist() == env.n_actions
+    assert env.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    history = play(env, 2 * env.horizon, seed=3)
+    done = np.stack([step[4]["macro_done"] for step in history if len(step) == 5])
+    assert done.any(0).all()
+
+
+@every_task
+def test_gymnasium_checker(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(f"{env_id}-v0").unwrapped, skip_render_check=True)
+        check_env(gym.make(f"{env_id}-v0", render_mode="rgb_array").unwrapped)
+        batch = gym.make_vec(f"{env_id}-v0", num_envs=3)
+    assert isinstance(batch, envs.MacroVectorEnv) and batch.num_envs == 3
+
+
+@every_task
+def test_same_seed_same_trajectory(env_id):
+    history = play(envs.make(env_id, 3), 120, seed=0)
+    assert_same(history, play(envs.make(env_id, 3), 120, seed=0))
+    if env_id.startswith("ct"):  # the other domains are deterministic
+        for other_seed in (1, 2):
+            with pytest.raises(AssertionError):
+                assert_same(history, play(envs.make(env_id, 3), 120, seed=other_seed))
+        assert (history[0][0][0] != history[0][0][1]).any(), "environments of a batch differ"
+
+
+@every_task
+def test_no_call_changes_what_another_returned(env_id):
+    env = envs.make(env_id, 2)
+    first = env.reset(seed=1)
+    kept = [first[0].copy(), {key: value.copy() for key, value in first[1].items()}]
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        step = env.step(rng.integers(0, env.n_actions, (2, env.n_agents)))
+        copies = [np.copy(part) for part in step[:4]] + [value.copy() for value in step[4].values()]
+        env.reset(options={"reset_mask": np.array([True, False])})
+        assert_same([*step[:4], *step[4].values()], copies)
+    assert_same(list(first), kept)
+
+
+@every_task
+def test_single_view_is_the_batch_of_one(env_id):
+    batch, single = envs.make(env_id, 1), gym.make(f"{env_id}-v0").unwrapped
+    rng = np.random.default_rng(5)
+    obs, infos = batch.reset(seed=7)
+    single_obs, info = single.reset(seed=7)
+    for _ in range(batch.horizon):
+        np.testing.assert_array_equal(obs[0], single_obs)
+        assert_same({key: value[0] for key, value in infos.items()}, info)
+        actions = rng.integers(0, batch.n_actions, (1, batch.n_agents))
+        obs, rewards, terminations, truncations, infos = batch.step(actions)
+        single_obs, reward, terminated, truncated, info = single.step(actions[0])
+        assert (reward, terminated, truncated) == (rewards[0], terminations[0], truncations[0])
+        if terminated or truncated:
+            break
+    assert terminated or truncated
+
+
+@every_task
+def test_saved_state_continues_exactly(env_id):
+    env = envs.make(env_id, 4)
+    play(env, 37, seed=2)
+    saved = env.save_state()
+    rng, steps = np.random.default_rng(1), []
+    for _ in range(25):
+        steps.append(rng.integers(0, env.n_actions, (4, env.n_agents)))
+    other = envs.make(env_id, 4)
+    other.reset(seed=99)
+
+    def go_on(env):
+        history = []
+        for actions in steps:
+            history.append(env.step(actions))
+            over = history[-1][2] | history[-1][3]
+            if over.any():
+                history.append(env.reset(options={"reset_mask": over}))
+        return history
+
+    expected = go_on(env)
+    obs, infos = other.load_state(saved)
+    np.testing.assert_array_equal(obs, saved["_obs"])
+    np.testing.assert_array_equal(infos["macro_done"], saved["macro_done"])
+    assert_same(expected, go_on(other))
+    with pytest.raises(ValueError, match="another environment"):
+        envs.make(env_id, 5).load_state(saved)
+
+
+def test_reset_mask_touches_only_its_environments():
+    env = envs.make("ct-10", 3)
+    play(env, 5, seed=0)
+    before = env.save_state()
+    env.reset(options={"reset_mask": np.array([False, True, False])})
+    after = env.save_state()
+    for name in ("position", "target", "elapsed", "episode_return", "_obs"):
+        np.testing.assert_array_equal(before[name][[0, 2]], after[name][[0, 2]])
+    assert after["elapsed"].tolist() == [5, 0, 5]
+
+
+def test_bad_input_says_what_is_wrong():
+    with pytest.raises(ValueError, match=r"unknown environment 'wtd'.*valid ids: bp-10"):
+        envs.make("wtd")
+    for arguments, message in (
+        (dict(num_envs=0), "num_envs must be at least 1"),
+        (dict(horizon=0), "horizon must be at least 1"),
+        (dict(render_mode="human"), "render_mode must be None or one of"),
+        (dict(grid=7), "grid must be an even number"),
+        (dict(small_boxes=[(1.5, 9.5), (8.5, 5.5)]), "below the goal row"),
+        (dict(agent_starts=[(1.0, 1.5), (8.5, 1.5)]), "cell centres inside the grid"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            envs.make("bp-10", **arguments)
+    env = envs.make("bp-10", 2)
+    with pytest.raises(ValueError, match="never reset"):
+        env.step(np.zeros((2, 2), int))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"agent 1 of environment 0 was given macro-action 8: it has 0..7"):
+        env.step(np.array([[0, 8], [0, 0]]))
+    with pytest.raises(ValueError, match="was given macro-action -1"):
+        env.step(np.array([[0, 0], [-1, 0]]))
+    with pytest.raises(ValueError, match="must be integers of shape"):
+        env.step(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="must be integers of shape"):
+        env.step(np.zeros((1, 2), int))
+    with pytest.raises(ValueError, match="reset_mask"):
+        env.reset(options={"reset_mask": [1, 0]})
+    for _ in range(100):
+        _, _, terminations, truncations, _ = env.step(np.full((2, 2), 7))
+    assert truncations.all() and not terminations.any()
+    with pytest.raises(ValueError, match="have ended"):
+        env.step(np.full((2, 2), 7))
+
+
+def test_keywords_change_the_task():
+    env = envs.make("bp-10", step_cost=-0.5, penalty=-3.0, horizon=12)
+    env.reset(seed=0)
+    _, reward, _, _, _ = env.step(np.array([[5, 4]]))  # the west-facing agent is eight steps from the wall
+    assert reward[0] == -0.5
+    for _ in range(7):
+        _, _, _, _, infos = env.step(np.array([[7, 7]]))
+    assert infos["macro_done"].all(), "Push ended on reaching the border"
+    _, reward, _, _, _ = env.step(np.array([[7, 4]]))
+    assert reward[0] == -3.5, "and walking into it costs a penalty"
+
+
+def test_primitive_big_box_needs_both():
+    env = envs.make("bp-10-primitive", agent_starts=[(4.5, 4.5), (5.5, 4.5)], agent_orientations=(0, 0))
+    env.reset(seed=0)
+    _, reward, _, _, infos = env.step(np.array([[0, 3]]))
+    assert reward[0] == pytest.approx(-10.1) and infos["state"][0, 17] == pytest.approx(0.55)
+    total = 0.0
+    for _ in range(4):
+        _, reward, terminations, _, infos = env.step(np.array([[0, 0]]))
+        total += reward[0]
+    assert terminations[0] and infos["success"][0] and total == pytest.approx(100 - 0.4)
