@@ -221,7 +221,7 @@ class QPLEXMixer(nn.Module):
         def hypernetwork(inputs, outputs):
             return nn.Sequential(nn.Linear(inputs, heads * embed), nn.ReLU(True), nn.Linear(heads * embed, outputs))
 
-        self.of_state = hypernetwork(state_size, 2 * n + heads + heads * n)
+        self.of_state = hypernetwork(state_size + n * widest * mask_ongoing, 2 * n + heads + heads * n)
         if joint_action:
             self.of_action = hypernetwork(state_size + n * widest, heads * n)
         self.register_buffer("actions", torch.arange(widest), persistent=False)
@@ -234,15 +234,17 @@ class QPLEXMixer(nn.Module):
             chosen: bool [..., n], False for ongoing agents. state: float32 [..., S].
         """
         n = utilities.shape[-1]
-        if self.mask_ongoing:  # an ongoing agent can only go on: its value is that of its macro-action
+        one_hot = (actions[..., None] == self.actions).float()  # [..., agents, actions]
+        given = state
+        if self.mask_ongoing:  # an ongoing agent can only go on: its value is that of its macro-action, and m^- is given
             values = torch.where(chosen, values, utilities)
-        weight, bias, key, agent = self.of_state(state).split([n, n, self.heads, self.heads * n], -1)
+            given = torch.cat([state, (one_hot * ~chosen[..., None]).flatten(-2)], -1)  # [..., S + agents * actions]
+        weight, bias, key, agent = self.of_state(given).split([n, n, self.heads, self.heads * n], -1)
         weight = weight.abs() + 1e-10  # positive: the transform keeps each agent's order of macro-actions
         advantages = (weight * (utilities - values)).detach()
         attention = key.abs()[..., None] * torch.sigmoid(agent.unflatten(-1, (self.heads, n)))  # [..., heads, agents]
         if self.joint_action:
-            one_hot = (actions[..., None] == self.actions).float().flatten(-2)  # [..., agents * actions]
-            action = self.of_action(torch.cat([state, one_hot], -1))
+            action = self.of_action(torch.cat([state, one_hot.flatten(-2)], -1))
             attention = attention * torch.sigmoid(action.unflatten(-1, (self.heads, n)))
         lambdas = attention.sum(-2)  # [..., agents], not negative: no agent gains by a worse advantage
         return (weight * utilities + bias + (lambdas - 1) * advantages).sum(-1)
@@ -536,6 +538,7 @@ def train(args):
         saved = {"learner": learner.state_dict(), "target": target.state_dict(), "optimizer": optimizer.state_dict()}
         arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
         saved |= {"buffer": buffer.save(), "env": arrays, "hidden": hidden, "rng": rng.bit_generator.state}
+        writer.flush()  # what was logged up to here is not logged again after a resume
         save(saved | {"step": step, "updates": updates, "recent": recent, "models": models}, folder / "checkpoint.pt")
 
     # Ctrl-C and a termination signal take effect between two steps, where a checkpoint is whole; a second one at once.
@@ -614,10 +617,10 @@ def train(args):
     for number, handler in handlers.items():
         signal.signal(number, handler)
     bar.close()
-    writer.close()
     if stop:
         save_checkpoint()
         print(f"stopped at step {step}; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
+    writer.close()
     return folder
 
 

@@ -197,7 +197,7 @@ class MacroVectorEnv(VectorEnv, ABC):
             if name not in saved or np.shape(saved[name]) != getattr(self, name).shape:
                 raise ValueError(f"the saved state is of another environment: {name!r} is missing or of another shape")
         for name in self._checkpointed():
-            setattr(self, name, np.array(saved[name]))
+            setattr(self, name, np.asarray(saved[name]).copy())
         self.np_random.bit_generator.state = saved["np_random"]
         return self._obs.copy(), self._infos()
 
