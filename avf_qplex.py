@@ -22,6 +22,7 @@ Numbered deviations from the paper:
     --hysteresis-start 1 is the paper's loss.
 """
 
+# >>> imports, identical to avf_vdn.py
 import argparse
 import copy
 import json
@@ -45,10 +46,12 @@ from tqdm import tqdm
 import envs
 
 ALGORITHM = Path(__file__).stem
+# <<< imports
 
 
 @dataclass
 class Args:
+    # >>> run arguments, identical to avf_vdn.py
     env: str = "wtd-s"
     """task, one of envs.IDS"""
     seed: int = 1
@@ -77,7 +80,9 @@ class Args:
     """with --evaluate: the model of the best greedy evaluation or of the last one"""
     gif: str | None = None
     """with --evaluate: file for an animation of one episode"""
+    # <<< run arguments
 
+    # >>> learning arguments, identical to avf_vdn.py
     # Algorithm
     learning_rate: float = 5e-4
     """Adam's step size"""
@@ -115,12 +120,15 @@ class Args:
     """recurrent state at the start of a window: zeros, or the one stored when acting"""
     hidden_size: int = 64
     """width of the agents' layers"""
+    # <<< learning arguments
     mixing_embed: int = 32
     """width of the mixer's hypernetworks"""
     mixer_state: Literal["joint", "single", "real", "decision"] = "joint"
     """mixer input: joint macro-state, one agent's macro-state, true state at the end of the interval or at the row"""
     mask_ongoing: bool = True
     """ongoing agents have advantage 0 (deviation 1)"""
+    see_ongoing: bool = False
+    """the mixer's hypernetworks see the macro-actions of ongoing agents beside the state"""
     advantage: Literal["max", "dueling"] = "max"
     """A_i = Q_i - max Q_i with lambda_i(s, m), or a dueling head of any sign with lambda_i(s)"""
 
@@ -135,11 +143,7 @@ DEFAULTS = {
 }  # fmt: skip
 
 
-def defaults(env_id, **overrides):
-    """The Args in force for a task; overrides are fields by name."""
-    return Args(**{"env": env_id, **DEFAULTS.get(env_id.split("-")[0], {}), **overrides})
-
-
+# >>> agents, identical to avf_vdn.py
 class AgentLinear(nn.Module):
     """A linear layer for each agent, as one batched product: [n, M, inputs] -> [n, M, outputs]."""
 
@@ -156,19 +160,18 @@ class AgentLinear(nn.Module):
 class Agents(nn.Module):
     """The agents' utility networks, one each: Linear, ReLU, GRU, Linear, ReLU, Linear.
 
-    n_actions: a list of n ints. obs_size: width d of the padded macro-observation. dueling: Q_i = V_i + A_i of two
-    heads.
+    n_actions: a list of n ints. obs_size: width d of the padded macro-observation.
     """
 
-    def __init__(self, n_actions, obs_size, hidden_size, dueling=False):
+    def __init__(self, n_actions, obs_size, hidden_size):
         super().__init__()
         n, widest, bound = len(n_actions), max(n_actions), hidden_size**-0.5
-        self.n_actions, self.hidden_size, self.dueling = np.array(n_actions), hidden_size, dueling
+        self.n_actions, self.hidden_size = np.array(n_actions), hidden_size
         self.encoder = AgentLinear(n, obs_size + widest, hidden_size)
         self.gru_input = AgentLinear(n, hidden_size, 3 * hidden_size)
         self.gru_hidden = nn.Parameter(torch.empty(n, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
         self.head = AgentLinear(n, hidden_size, hidden_size)
-        self.output = AgentLinear(n, hidden_size, widest + dueling)
+        self.output = AgentLinear(n, hidden_size, widest)
         self.register_buffer("actions", torch.arange(widest), persistent=False)
         self.register_buffer("padding", self.actions >= torch.tensor(n_actions)[:, None, None], persistent=False)
 
@@ -195,11 +198,25 @@ class Agents(nn.Module):
             hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
             states.append(hidden)
         states = torch.cat(states, 1)  # [agents, M, hidden]
-        utilities = self.output(F.relu(self.head(states)))  # [agents, M, actions (+ 1)]
-        if self.dueling:
-            utilities, values = utilities[..., :-1] + utilities[..., -1:], utilities[..., -1]
+        utilities = self.output(F.relu(self.head(states)))  # [agents, M, actions]
         utilities = utilities.masked_fill(self.padding, -torch.inf)
-        return utilities, values if self.dueling else utilities.amax(2), states
+        return utilities, utilities.amax(2), states
+
+
+# <<< agents
+
+
+class DuelingAgents(Agents):
+    """Utilities from two heads, Q_i = V_i + A_i with advantages of any sign (Def. 3.3)."""
+
+    def __init__(self, n_actions, obs_size, hidden_size):
+        super().__init__(n_actions, obs_size, hidden_size)
+        self.value = AgentLinear(len(n_actions), hidden_size, 1)
+
+    def forward(self, obs, previous, hidden, sizes):
+        advantages, _, states = super().forward(obs, previous, hidden, sizes)
+        values = self.value(states)  # [agents, M, 1]
+        return values + advantages, values[..., 0], states
 
 
 class QPLEXMixer(nn.Module):
@@ -210,20 +227,21 @@ class QPLEXMixer(nn.Module):
     lambda_i = sum over heads of |key(s)| sigmoid(agent_i(s)) sigmoid(action_i(s, m)) >= 0.
 
     n_actions: a list of n ints. state_size: width of the mixer input. mask_ongoing: A_i = 0 for ongoing agents.
-    joint_action: lambda_i depends on m.
+    see_ongoing: s is joined by the macro-actions m^- of ongoing agents, one-hot. joint_action: lambda_i depends on m.
     """
 
-    def __init__(self, n_actions, state_size, embed=32, heads=4, mask_ongoing=True, joint_action=True):
+    def __init__(
+        self, n_actions, state_size, embed=32, heads=4, mask_ongoing=True, see_ongoing=True, joint_action=True
+    ):
         super().__init__()
         n, widest = len(n_actions), max(n_actions)
-        self.heads, self.mask_ongoing, self.joint_action = heads, mask_ongoing, joint_action
+        self.heads, self.mask_ongoing, self.see_ongoing = heads, mask_ongoing, see_ongoing
 
         def hypernetwork(inputs, outputs):
             return nn.Sequential(nn.Linear(inputs, heads * embed), nn.ReLU(True), nn.Linear(heads * embed, outputs))
 
-        self.of_state = hypernetwork(state_size + n * widest * mask_ongoing, 2 * n + heads + heads * n)
-        if joint_action:
-            self.of_action = hypernetwork(state_size + n * widest, heads * n)
+        self.of_state = hypernetwork(state_size + n * widest * see_ongoing, 2 * n + heads + heads * n)
+        self.of_action = hypernetwork(state_size + n * widest, heads * n) if joint_action else None
         self.register_buffer("actions", torch.arange(widest), persistent=False)
 
     def forward(self, utilities, values, actions, chosen, state):
@@ -236,20 +254,22 @@ class QPLEXMixer(nn.Module):
         n = utilities.shape[-1]
         one_hot = (actions[..., None] == self.actions).float()  # [..., agents, actions]
         given = state
-        if self.mask_ongoing:  # an ongoing agent can only go on: its value is that of its macro-action, and m^- is given
-            values = torch.where(chosen, values, utilities)
+        if self.see_ongoing:  # m^- is fixed while the others choose, so Mac-IGM is not touched
             given = torch.cat([state, (one_hot * ~chosen[..., None]).flatten(-2)], -1)  # [..., S + agents * actions]
+        if self.mask_ongoing:  # an ongoing agent can only go on: its value is that of its macro-action
+            values = torch.where(chosen, values, utilities)
         weight, bias, key, agent = self.of_state(given).split([n, n, self.heads, self.heads * n], -1)
         weight = weight.abs() + 1e-10  # positive: the transform keeps each agent's order of macro-actions
         advantages = (weight * (utilities - values)).detach()
         attention = key.abs()[..., None] * torch.sigmoid(agent.unflatten(-1, (self.heads, n)))  # [..., heads, agents]
-        if self.joint_action:
+        if self.of_action:
             action = self.of_action(torch.cat([state, one_hot.flatten(-2)], -1))
             attention = attention * torch.sigmoid(action.unflatten(-1, (self.heads, n)))
         lambdas = attention.sum(-2)  # [..., agents], not negative: no agent gains by a worse advantage
         return (weight * utilities + bias + (lambdas - 1) * advantages).sum(-1)
 
 
+# >>> replay, identical to avf_vdn.py
 class Batch(NamedTuple):
     """A batch of B windows of up to W decision rows: R rows in all, n agents.
 
@@ -407,6 +427,10 @@ class ReplayBuffer:
             array[filled] = saved[f"{part}/{key}"].numpy()
 
 
+# <<< replay
+
+
+# >>> td loss, identical to avf_vdn.py
 def td_loss(utilities, values, target_utilities, target_values, mixer, target_mixer, batch, td_lambda=0, hysteresis=1):
     """The loss of Eq. 14 over the rows of a batch, with double Q-learning.
 
@@ -443,6 +467,10 @@ def td_loss(utilities, values, target_utilities, target_values, mixer, target_mi
     return torch.where(error < 0, hysteresis * error, error).square().mean(), q, target
 
 
+# <<< td loss
+
+
+# >>> acting, identical to avf_vdn.py
 def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
     """Epsilon-greedy macro-actions of the free agents.
 
@@ -493,17 +521,22 @@ def evaluate(agents, env, gamma, seed, frames=None):
     return result
 
 
-def make_networks(args, env):
-    """Agents and mixer for an environment, as one module."""
+# <<< acting
+
+
+def make_learner(args, env):
+    """Agents and mixer as one module on the device, and the replay buffer."""
+    dueling, obs_size = args.advantage == "dueling", env.single_observation_space.shape[1]
+    agents = (DuelingAgents if dueling else Agents)(env.n_actions, obs_size, args.hidden_size)
     width = env.state_size * (env.n_agents if args.mixer_state == "joint" else 1)
-    agents = Agents(env.n_actions, env.single_observation_space.shape[1], args.hidden_size, args.advantage == "dueling")
-    joint_action = args.advantage == "max"  # deviation 2
-    mixer = QPLEXMixer(
-        env.n_actions, width, args.mixing_embed, mask_ongoing=args.mask_ongoing, joint_action=joint_action
-    )
-    return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device)
+    options = dict(mask_ongoing=args.mask_ongoing, see_ongoing=args.see_ongoing, joint_action=not dueling)
+    mixer = QPLEXMixer(env.n_actions, width, args.mixing_embed, **options)
+    stored_hidden = args.hidden_size * (args.hidden_state == "stored")
+    buffer = ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state, stored_hidden)
+    return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device), buffer
 
 
+# >>> training, identical to avf_vdn.py
 def train(args):
     """Trains from Args, or goes on with the run args.resume; returns the run folder."""
     check(args)
@@ -511,12 +544,10 @@ def train(args):
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
     env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
-    learner = make_networks(args, env)
+    learner, buffer = make_learner(args, env)
     target = copy.deepcopy(learner).requires_grad_(False)
     agents, mixer = learner["agents"], learner["mixer"]
     optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
-    stored_hidden = args.hidden_size if args.hidden_state == "stored" else 0
-    buffer = ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state, stored_hidden)
     if args.resume:
         folder, saved = Path(args.resume), load_file(args.resume, "checkpoint.pt")
         for name, part in (("learner", learner), ("target", target), ("optimizer", optimizer)):
@@ -624,12 +655,16 @@ def train(args):
     return folder
 
 
+# <<< training
+
+
+# >>> runs, identical to avf_vdn.py
 def report(args):
     """Evaluates the model of the run folder args.evaluate, prints the result and writes the animation args.gif."""
     check(args)
     torch.set_num_threads(args.torch_threads)
     env = envs.make(args.env, args.eval_episodes, render_mode="rgb_array" if args.gif else None)
-    learner, model = make_networks(args, env), load_file(args.evaluate, "model.pt")[args.model]
+    (learner, _), model = make_learner(args, env), load_file(args.evaluate, "model.pt")[args.model]
     learner.load_state_dict(model["networks"])
     frames = [] if args.gif else None
     result = evaluate(learner["agents"], env, args.gamma, args.seed, frames)
@@ -716,6 +751,11 @@ def load_args(folder):
         fail(f"{folder} is not a run folder: args.json: {error}")
 
 
+def defaults(env_id, **overrides):
+    """The Args in force for a task; overrides are fields by name."""
+    return Args(**{"env": env_id, **DEFAULTS.get(env_id.split("-")[0], {}), **overrides})
+
+
 def parse_args(argv=None):
     """Args from the command line, over the defaults of the environment family or the settings of the run continued."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -745,3 +785,4 @@ def main():
 
 if __name__ == "__main__":
     main()
+# <<< runs

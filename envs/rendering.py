@@ -336,7 +336,7 @@ def draw_capture_target(env, index):
         canvas.dashes(start, end, MUTED)  # an open border: the world wraps around
 
     x, y = pixel(*(target + 0.5))
-    canvas.box(x - cell / 2, y - cell / 2, cell, cell, ALARM_PALE, ALARM, max(1, cell / 24))
+    canvas.box(x - cell / 2, y - cell / 2, cell, cell, ALARM_PALE)
     _cross(canvas, x, y, cell * 0.56)  # its ends are seen however many agents stand on it
     for place in np.unique(position, axis=0):
         here = np.flatnonzero((position == place).all(1))

@@ -15,9 +15,9 @@ from tests.matrix_game import MatrixGame
 
 
 def collect(env_id, episodes, num_envs=3, seed=0, mixer_state="joint", capacity=None, gamma=0.9, epsilon=0.7):
-    """Plays with random networks into a buffer that stores the recurrent states; returns it, the agents and a log of the
-    steps of each episode, in the order in which they ended: (obs, state, free, actions, reward, hidden) per step, then the
-    final (obs, state, terminated)."""
+    """Plays with random networks into a buffer that stores the recurrent states; returns it, the agents and a log of
+    the steps of each episode, in the order in which they ended: (obs, state, free, actions, reward, hidden) per step, then
+    the final (obs, state, terminated)."""
     torch.manual_seed(seed)
     env, rng = envs.make(env_id, num_envs), np.random.default_rng(seed)
     agents = Agents(env.n_actions, env.single_observation_space.shape[1], hidden_size=8)
@@ -117,7 +117,7 @@ def test_hidden_state_starts_at_zero_in_every_episode():
 
 
 def test_windows_never_mix_episodes():
-    """A ring far smaller than what is played, so that slots are overwritten: each row and decision carries its episode."""
+    """A ring far smaller than what is played, so that slots are overwritten; all that is stored tells its episode."""
     env = envs.make("bp-10", 4)
     buffer, rng, tag, hidden = ReplayBuffer(env, 7, 0.9), np.random.default_rng(0), np.arange(4.0), torch.zeros(2, 4, 0)
     _, infos = env.reset(seed=0)
@@ -153,10 +153,10 @@ def test_windows_never_mix_episodes():
 def test_mixer_state_feeds_the_rows_it_says(mixer_state):
     """Two agents, decisions worked out by hand; the state is the time step.
 
-        t        0     1     2     3     4     5 (end, truncated)
-        agent 0  a0          a1          a2
-        agent 1  b0    b1          b2
-        row      0     1     2     3     4     5
+    t        0     1     2     3     4     5 (end, truncated)
+    agent 0  a0          a1          a2
+    agent 1  b0    b1          b2
+    row      0     1     2     3     4     5
     """
     env = envs.make("bp-10", 1)
     buffer = ReplayBuffer(env, 2, 1.0, mixer_state)
@@ -173,9 +173,9 @@ def test_mixer_state_feeds_the_rows_it_says(mixer_state):
     batch = buffer.sample(1, 5, np.random.default_rng(0))
     got = batch.state.reshape(5, -1, env.state_size)[..., 0].tolist()
     later = batch.next_state.reshape(5, -1, env.state_size)[..., 0].tolist()
-    # joint: when each agent last chose. single: that of the agent whose macro-action ends with the row's interval (agent 1
-    # at row 0, 0 at row 1, 1 at row 2, 0 at row 3, both, so 0, at row 4). Every row lasts one step here, so `real` is tested
-    # below with longer rows.
+    # joint: when each agent last chose. single: that of the agent whose macro-action ends with the row's interval (agent
+    # 1 at row 0, 0 at row 1, 1 at row 2, 0 at row 3, both, so 0, at row 4). Every row lasts one step here: the next test
+    # has longer ones for `real`.
     expected = {
         "joint": ([[0, 0], [0, 1], [2, 1], [2, 3], [4, 3]], [[0, 1], [2, 1], [2, 3], [4, 3], [5, 5]]),
         "single": ([[0], [0], [1], [2], [4]], [[1], [2], [3], [4], [5]]),
@@ -205,8 +205,9 @@ def hand_made_batch():
 
     Window 0 (rows 0, 1; terminates after row 1). Row 0: both choose. Row 1: only agent 1 chooses, agent 0 is ongoing.
     Window 1 (rows 2, 3; truncated after row 3). Row 2: both choose. Row 3: only agent 0 chooses, agent 1 is ongoing.
-    Entries: 0, 1 the windows' first decisions, 2, 3 the second ones, 4, 5 the third ones. Agent 0 has in window 0 entries
-    0 and 4 (the end), in window 1 entries 1, 3 and 5 (the end); agent 1 in window 0 0, 2, 4 (end) and in window 1 1, 3 (end).
+    Entries: 0, 1 the windows' first decisions, 2, 3 the second ones, 4, 5 the third ones. Agent 0 has in window 0
+    entries 0 and 4 (the end), in window 1 entries 1, 3 and 5 (the end); agent 1 in window 0 0, 2, 4 (end) and in window
+    1 1, 3 (end).
     """
     entry = torch.tensor([[0, 0], [0, 2], [1, 1], [3, 1]])
     next_entry = torch.tensor([[0, 2], [4, 4], [3, 1], [5, 3]])
@@ -234,9 +235,9 @@ def vdn(utilities, values, actions, chosen, state):
 def test_td_target_by_hand():
     """Row 0: agent 0 goes on with macro-action 1 of entry 0 (target 20, though the online argmax there is 1 as well by
     chance: see the next test), agent 1 chooses at entry 2, online argmax 1, target 65: y = 1 + 0.81 * 85 = 69.85.
-    Row 1: terminated: y = 2. Row 2: agent 0 chooses at entry 3, argmax 1, target 60; agent 1 goes on with macro-action 1 of
-    entry 1, target 45: y = 3 + 0.9 * 105 = 97.5. Row 3: truncated, so it bootstraps from the final observation: agent 0 at
-    entry 5, argmax 1, 80; agent 1 at entry 3, argmax 0, 75: y = 4 + 0.729 * 155 = 116.995.
+    Row 1: terminated: y = 2. Row 2: agent 0 chooses at entry 3, argmax 1, target 60; agent 1 goes on with macro-action
+    1 of entry 1, target 45: y = 3 + 0.9 * 105 = 97.5. Row 3: truncated, so it bootstraps from the final observation:
+    agent 0 at entry 5, argmax 1, 80; agent 1 at entry 3, argmax 0, 75: y = 4 + 0.729 * 155 = 116.995.
     Joint values: row 0: 2 + 5 = 7, row 1: 2 + 8 = 10, row 2: 3 + 2 = 5, row 3: 5 + 2 = 7."""
     batch = hand_made_batch()
     loss, q, target = td_loss(ONLINE, ONLINE.amax(2), TARGET, TARGET.amax(2), vdn, vdn, batch)
@@ -252,7 +253,10 @@ def test_td_target_by_hand():
 def test_conditional_argmax_never_changes_an_ongoing_macro_action():
     """Make the other macro-action of the ongoing agents far better: the target must not move."""
     batch, tempting = hand_made_batch(), ONLINE.clone()
-    tempting[0, 0, 0], tempting[1, 1, 0] = 1000.0, 1000.0  # agent 0 at entry 0 and agent 1 at entry 1 run macro-action 1
+    tempting[0, 0, 0], tempting[1, 1, 0] = (
+        1000.0,
+        1000.0,
+    )  # agent 0 at entry 0 and agent 1 at entry 1 run macro-action 1
     seen = []
 
     def target_mixer(utilities, values, actions, chosen, state):
@@ -267,7 +271,7 @@ def test_conditional_argmax_never_changes_an_ongoing_macro_action():
 
 def test_q_lambda_by_hand():
     """lambda = 0.5. Window 0: G[1] = 2; G[0] = 1 + 0.81 (0.5 * 85 + 0.5 * 2) = 36.235. Window 1: G[3] = 116.995;
-    G[2] = 3 + 0.9 (0.5 * 105 + 0.5 * 116.995) = 102.89775. A window cut after its first row keeps the one-row target."""
+    G[2] = 3 + 0.9 (0.5 * 105 + 0.5 * 116.995) = 102.89775. A window cut after row 0 keeps the one-row target."""
     batch = hand_made_batch()
     _, _, target = td_loss(ONLINE, ONLINE.amax(2), TARGET, TARGET.amax(2), vdn, vdn, batch, td_lambda=0.5)
     torch.testing.assert_close(target, torch.tensor([36.235, 2.0, 102.89775, 116.995]))
@@ -294,13 +298,15 @@ def test_primitive_target_is_the_textbook_one():
     _, _, target = td_loss(q, v, next_q, next_v, vdn, vdn, batch)
     for row in range(0, len(target), 5):
         later = [(q[i, e], next_q[i, e]) for i, e in enumerate(batch.next_entry[row])]
-        textbook = batch.reward[row] + batch.discount[row] * sum(evaluated[online.argmax()] for online, evaluated in later)
+        textbook = batch.reward[row] + batch.discount[row] * sum(
+            evaluated[online.argmax()] for online, evaluated in later
+        )
         torch.testing.assert_close(target[row], textbook)
 
 
 def test_gradients_reach_everything_and_never_the_target():
     env, _, buffer, _ = collect("wtd-s", 6)
-    learner = avf_qplex.make_networks(Args(hidden_size=8), env)
+    learner, _ = avf_qplex.make_learner(Args(hidden_size=8), env)
     target = copy.deepcopy(learner).requires_grad_(False)
     batch = buffer.sample(8, 10, np.random.default_rng(0))
     q, v, _ = learner["agents"](batch.obs, batch.previous, None, batch.sizes)
@@ -372,7 +378,7 @@ def test_greedy_utilities_maximise_the_joint_value(advantage):
 
 
 def test_acting():
-    """Ongoing agents keep macro-action and recurrent state; epsilon 1 is uniform over each agent's own macro-actions."""
+    """Ongoing agents keep macro-action and recurrent state; epsilon 1 is uniform over an agent's own macro-actions."""
     torch.manual_seed(0)
     agents, rng = Agents([2, 4], 3, 8), np.random.default_rng(0)
     obs, hidden = np.random.default_rng(1).random((4000, 2, 3), np.float32), torch.randn(2, 4000, 8)
@@ -399,7 +405,7 @@ def test_evaluation_counts_the_first_episode_of_each_environment():
     env.reset(seed=3)
     length, success = np.zeros(40), np.zeros(40)
     while (length == 0).any():
-        _, rewards, terminations, truncations, _ = env.step(np.zeros((40, 10), int))
+        _, _, terminations, truncations, _ = env.step(np.zeros((40, 10), int))
         over = terminations | truncations
         first = over & (length == 0)
         length[first], success[first] = env.elapsed[first], terminations[first]
@@ -420,7 +426,10 @@ TINY = dict(num_envs=4, total_timesteps=1_200, learning_starts=200, train_freque
     "env_id, options",
     [("ct-10", {})]
     + [("wtd-s", dict(mixer_state=m)) for m in ("joint", "single", "real", "decision")]
-    + [("bp-10", dict(advantage="dueling")), ("bp-10", dict(mask_ongoing=False, hidden_state="stored"))]
+    + [
+        ("bp-10", dict(advantage="dueling", see_ongoing=True)),
+        ("bp-10", dict(mask_ongoing=False, hidden_state="stored")),
+    ]
     + [("bp-10-primitive", {}), ("wtd-s-primitive", {}), ("ct-10-primitive", {})],
 )
 def test_smoke_run_takes_gradient_steps(tmp_path, env_id, options):
@@ -429,7 +438,7 @@ def test_smoke_run_takes_gradient_steps(tmp_path, env_id, options):
     checkpoint = torch.load(folder / "checkpoint.pt", weights_only=True)
     assert checkpoint["updates"] == (1_200 - 200) // 40 and checkpoint["step"] == 1_200
     torch.manual_seed(args.seed)
-    start = avf_qplex.make_networks(args, envs.make(env_id)).state_dict()
+    start = avf_qplex.make_learner(args, envs.make(env_id))[0].state_dict()
     changed = [name for name, value in checkpoint["learner"].items() if not torch.equal(value, start[name])]
     assert len(changed) == len(start), "every parameter was updated"
     assert len(scalars(folder)["eval/return"]) == 3

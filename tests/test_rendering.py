@@ -217,13 +217,30 @@ def test_the_big_box_lights_up_while_both_push_it():
 def test_the_red_cross_is_seen_under_all_agents():
     env = started("ct-10")
     env.position[:], env.target[:] = 3, 8
-    free = pixels_of(picture(env), rendering.ALARM)
+    free = pixels_of(picture(env)[:, :600], rendering.ALARM)
     env.target[:] = 3
-    assert 0.25 * free < pixels_of(picture(env), rendering.ALARM) - rendering.PANEL * 6  # less the bar of the share
+    assert 0.25 * free < pixels_of(picture(env)[:, :600], rendering.ALARM)
+
+
+def test_a_tool_being_passed_is_in_the_hand_and_no_longer_on_the_table():
+    env = started("wtd-s")
+    nowhere = pixels_of(picture(env), rendering.SKY)
+    env.staged[0, 0], env.arm_task[:], env.arm_left[:] = 2, 1, 3
+    on_table = pixels_of(picture(env), rendering.SKY)
+    env.pass_ready[:] = True
+    assert nowhere < pixels_of(picture(env), rendering.SKY) < on_table
+
+
+def test_the_number_of_carried_tools_is_seen():
+    env = started("wtd-t1")
+    env.carried[0, 0] = [0, 2, 0]
+    two = picture(env)
+    env.carried[0, 0] = [0, 3, 0]
+    assert (picture(env) != two).any()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_robot_colour_and_staged_tool_is_in_a_busy_warehouse(layout):
+def test_staged_and_carried_tools_are_drawn_in_their_colours(layout):
     env = started(f"wtd-{layout}")
     empty = [pixels_of(picture(env), colour) for _, _, colour in rendering.TOOLS]
     env.staged[0], env.carried[0, 0] = [0, 2], [0, 1, 0]

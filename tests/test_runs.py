@@ -1,7 +1,8 @@
-"""Run folders, checkpoints and the command line of the scripts, in processes of their own where a kill is part of it."""
+"""Run folders, checkpoints and the command line of the scripts, in processes of their own where one is killed."""
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -29,7 +30,9 @@ def flags(options):
 def start(*arguments, cwd=ROOT):
     command = [sys.executable, str(ROOT / "avf_qplex.py"), *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(command, cwd=cwd, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(
+        command, cwd=cwd, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
 
 
 def wait_for_checkpoint(runs, process, step):
@@ -109,7 +112,9 @@ def test_evaluate_prints_and_animates(tmp_path, capsys):
     assert "success" in printed and "discounted return" in printed and "last model of step 2400" in printed
     with Image.open(gif) as animation:
         assert animation.n_frames > 5 and np.asarray(animation.convert("RGB")).std() > 10
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([folder.name, gif.name]), "evaluating makes no run folder"
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([folder.name, gif.name]), (
+        "evaluating makes no run folder"
+    )
 
 
 @pytest.mark.parametrize(
@@ -152,17 +157,17 @@ def test_folders_of_other_runs_are_refused(tmp_path):
         (["--gamma=0.5"], "--gamma 0.5 does not fit"),
         (["--seed=8"], "--seed 8 does not fit"),
     ):
-        with pytest.raises(SystemExit, match=message):
+        with pytest.raises(SystemExit, match=re.escape(message)):
             parse_args([f"--resume={folder}", *arguments])
     (folder / "args.json").write_text((folder / "args.json").read_text().replace("avf_qplex", "avf_other", 1))
     with pytest.raises(SystemExit, match="is a run of avf_other, not of avf_qplex"):
         parse_args([f"--evaluate={folder}"])
     (folder / "args.json").write_bytes(before["args.json"])
     (folder / "checkpoint.pt").write_bytes(before["checkpoint.pt"][:1000])
-    with pytest.raises(SystemExit, match="checkpoint.pt is damaged"):
+    with pytest.raises(SystemExit, match=r"checkpoint\.pt is damaged"):
         train(parse_args([f"--resume={folder}", "--total-timesteps=800"]))
     (folder / "model.pt").unlink()
-    with pytest.raises(SystemExit, match="there is no model.pt"):
+    with pytest.raises(SystemExit, match=r"there is no model\.pt"):
         report(parse_args([f"--evaluate={folder}"]))
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "checkpoint.pt"} == {
         name: content for name, content in before.items() if name not in ("checkpoint.pt", "model.pt")
