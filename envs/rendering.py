@@ -57,7 +57,8 @@ class Canvas:
         self.draw.rounded_rectangle(corners, radius * self.unit, fill, outline, self._width(line))
 
     def disc(self, x, y, radius, fill=None, outline=None, line=1.0):
-        self.draw.circle(*self._points([(x, y)]), radius * self.unit, fill, outline, self._width(line))
+        corners = self._points([(x - radius, y - radius), (x + radius, y + radius)])
+        self.draw.ellipse(corners, fill, outline, self._width(line))
 
     def line(self, points, fill, width=1.0):
         self.draw.line(self._points(points), fill, self._width(width))
@@ -73,7 +74,7 @@ class Canvas:
     def text(self, x, y, words, size=14.0, fill=INK, anchor="l", bold=False):
         """anchor: "l", "m" or "r", whether x is the left end, the middle or the right end; y is the middle."""
         size = max(size * self.unit, 10)
-        (at,), stroke = self._points([(x, y)]), size / 44 if bold else 0
+        (at,), stroke = self._points([(x, y)]), round(size / 44) if bold else 0
         self.draw.text(at, str(words), fill, _font(size), anchor + "m", stroke_width=stroke)
 
     def pixels(self):
@@ -266,15 +267,17 @@ def draw_warehouse(env, index):
 
 
 def _robot_note(env, index, robot):
-    """The direction in which a robot moves, (dx, dy) or None, and what it does besides its macro-action, in words."""
-    to_go = env.waypoints[robot, env.macro_action[index, robot]] - env.position[index, robot]
-    distance, location, time_left = hypot(*to_go), env.location[index, robot], env.time_left[index, robot]
-    if not env.macro_done[index, robot] and distance > 0:
+    """The direction in which a robot moves, (dx, dy) or None, and in words how far it is or where."""
+    position, running = env.position[index, robot], not env.macro_done[index, robot]
+    to_go = env.waypoints[robot, env.macro_action[index, robot]] - position
+    distance, location, waited = hypot(*to_go), env.location[index, robot], -env.time_left[index, robot]
+    if running and distance > 0:
         return (to_go[0] / distance, -to_go[1] / distance), f"{distance:.1f} m to go"
-    if not env.macro_done[index, robot] and time_left < 0:
-        return None, f"waits for a tool, {-time_left} of {env.tool_wait_steps}"
-    places = ["in the tool room", "at the table", "at no waypoint yet"]
-    return None, f"at workshop {location}" if location < env.n_humans else places[location - env.n_humans]
+    places = [*(f"at workshop {human}" for human in range(env.n_humans)), "in the tool room", "at the table"]
+    if location == len(places) or (position != env.waypoints[robot, location]).any():  # location is the last waypoint
+        return None, "at no waypoint"
+    waits = places[location] == "at the table" and waited > 0 and (running or env.primitive)
+    return None, f"waits for a tool, {waited} of {env.tool_wait_steps}" if waits else places[location]
 
 
 def _workshop(canvas, env, index, human):

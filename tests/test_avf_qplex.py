@@ -16,7 +16,7 @@ from tests.matrix_game import MatrixGame
 
 def collect(env_id, episodes, num_envs=3, seed=0, mixer_state="joint", capacity=None, gamma=0.9, epsilon=0.7):
     """Plays with random networks into a buffer that stores the recurrent states; returns it, the agents and a log of
-    the steps of each episode, in the order in which they ended: (obs, state, free, actions, reward, hidden) per step, then
+    steps of each episode, in the order in which they ended: (obs, state, free, actions, reward, hidden) per step and the
     the final (obs, state, terminated)."""
     torch.manual_seed(seed)
     env, rng = envs.make(env_id, num_envs), np.random.default_rng(seed)
@@ -173,9 +173,9 @@ def test_mixer_state_feeds_the_rows_it_says(mixer_state):
     batch = buffer.sample(1, 5, np.random.default_rng(0))
     got = batch.state.reshape(5, -1, env.state_size)[..., 0].tolist()
     later = batch.next_state.reshape(5, -1, env.state_size)[..., 0].tolist()
-    # joint: when each agent last chose. single: that of the agent whose macro-action ends with the row's interval (agent
-    # 1 at row 0, 0 at row 1, 1 at row 2, 0 at row 3, both, so 0, at row 4). Every row lasts one step here: the next test
-    # has longer ones for `real`.
+    # joint: when each agent last chose. single: that of the agent whose macro-action ends with the row's interval, agent 1
+    # at row 0, 0 at row 1, 1 at row 2, 0 at row 3, both, so 0, at row 4. Every row lasts one step: see the next test for
+    # `real`.
     expected = {
         "joint": ([[0, 0], [0, 1], [2, 1], [2, 3], [4, 3]], [[0, 1], [2, 1], [2, 3], [4, 3], [5, 5]]),
         "single": ([[0], [0], [1], [2], [4]], [[1], [2], [3], [4], [5]]),

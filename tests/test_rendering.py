@@ -130,7 +130,7 @@ SEEN = {
     ],
     "wtd-t1": [
         *PANEL,
-        *[("position", (0, 0, 0), 5.0), ("position", (0, 2, 1), 4.5), ("location", (0, 1), 4), ("location", (0, 1), 0)],
+        *[("position", (0, 0, 0), 5.0), ("position", (0, 2, 1), 4.5), ("location", (0, 0), 5)],
         *[("carried", (0, 1, 2), 1), ("carried", (0, 1, 0), 2), ("time_left", (0, 0), -5)],
         *[("staged", (0, 0), 2), ("staged", (0, 1), 0), ("found", (0, 1), 2), ("found", (0, 2), 3)],
         *[("arm_task", 0, 1), ("arm_left", 0, 2), ("pass_ready", 0, True)],
@@ -229,6 +229,19 @@ def test_a_tool_being_passed_is_in_the_hand_and_no_longer_on_the_table():
     on_table = pixels_of(picture(env), rendering.SKY)
     env.pass_ready[:] = True
     assert nowhere < pixels_of(picture(env), rendering.SKY) < on_table
+
+
+def test_where_a_robot_is_said_to_be():
+    env = started("wtd-s-primitive")
+    note, said = rendering._robot_note, []
+    for action in (2,) * 6 + (0,):  # 2.66 m to the table, a step of waiting, away again
+        env.step(np.array([[action, 1, 0]]))
+        said.append(note(env, 0, 0)[1])
+    assert said[0] == said[-1] == "at no waypoint" and said[4:6] == ["at the table", "waits for a tool, 1 of 10"]
+    env = started("wtd-s")
+    env.step(np.array([[1, 2, 0]]))
+    direction, words = note(env, 0, 0)
+    assert np.allclose(direction, np.array([-0.5, -2.0]) / np.hypot(0.5, 2.0)) and words == "1.5 m to go"
 
 
 def test_the_number_of_carried_tools_is_seen():
