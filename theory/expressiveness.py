@@ -151,9 +151,9 @@ def cone(name, sizes, ranks):
 
     "VDN": sums of utilities. "monotone": whatever rises with every utility (Eq. 1), a sum of indicators of upper sets.
     "QMIX": rises, and has rising differences (one layer of ELU is convex); a bound, for 2 agents. QPLEX, w_i > 0, b_i
-    and lambda_i >= 0 free: b + sum_i w_i V_i is a 1, and each disadvantage of a macro-action that is not greedy a -1, in
-    V_i for an ongoing agent and in lambda_i A_i for one that chooses. "literal": not conditioned, its weights see
-    neither who is ongoing nor m^-. "blind": conditioned, weights likewise. "conditioned": they see both.
+    and lambda_i >= 0 free: b + sum_i w_i V_i is a 1, and each disadvantage of a macro-action that is not greedy is a -1,
+    of an ongoing agent in V_i, of one that chooses in lambda_i A_i. "literal": not conditioned, its weights see neither
+    who is ongoing nor m^-. "blind": conditioned, weights likewise. "conditioned": they see both.
 
     Args:
         ranks: for each agent the order of its utilities, a permutation of 0 .. |M^i| - 1; the highest is greedy.
