@@ -458,6 +458,43 @@ def test_epsilon_falls(tmp_path):
     assert [round(value, 2) for _, value in epsilon] == [0.68, 0.37, 0.05, 0.05]
 
 
+def test_first_update_moves_the_target_by_polyak(tmp_path):
+    args = defaults(
+        "bp-10", runs_dir=str(tmp_path), polyak=0.9, **{**TINY, "total_timesteps": 400, "train_frequency": 200}
+    )
+    checkpoint = torch.load(train(args) / "checkpoint.pt", weights_only=True)
+    assert checkpoint["updates"] == 1
+    torch.manual_seed(args.seed)
+    start = avf_qplex.make_learner(args, envs.make("bp-10"))[0].state_dict()
+    for name, value in checkpoint["target"].items():
+        torch.testing.assert_close(value, 0.9 * start[name] + 0.1 * checkpoint["learner"][name])
+
+
+def test_training_resets_the_hidden_state_with_the_episode(tmp_path):
+    args = defaults("bp-10", runs_dir=str(tmp_path), hidden_state="stored", **{**TINY, "total_timesteps": 4_000})
+    saved = torch.load(train(args) / "checkpoint.pt", weights_only=True)
+    _, buffer = avf_qplex.make_learner(args, envs.make("bp-10", args.num_envs))
+    buffer.load(saved["buffer"])
+    hidden, decisions = buffer.data["hidden"][: buffer.size], buffer.data["decisions"][: buffer.size]
+    assert buffer.size > 10 and (decisions > 1).all()
+    assert not hidden[:, :, 0].any() and hidden[:, :, 1].any(axis=2).all()
+
+
+def test_training_passes_on_what_it_should(tmp_path, monkeypatch):
+    """Evaluation seeds differ from point to point and from run to run; hysteresis is annealed; rewards are scaled."""
+    seeds, betas, rewards = [], [], []
+    real_evaluate, real_loss, real_reward = avf_qplex.evaluate, avf_qplex.td_loss, ReplayBuffer.reward
+    monkeypatch.setattr(avf_qplex, "evaluate", lambda *a: seeds.append(a[3]) or real_evaluate(*a))
+    monkeypatch.setattr(avf_qplex, "td_loss", lambda *a: betas.append(a[8]) or real_loss(*a))
+    monkeypatch.setattr(ReplayBuffer, "reward", lambda self, r, s: rewards.append(r) or real_reward(self, r, s))
+    options = dict(hysteresis_start=0.2, hysteresis_end=0.8, exploration_timesteps=600, reward_scale=10.0)
+    for seed in (0, 1):
+        train(defaults("bp-10", seed=seed, runs_dir=str(tmp_path), **{**TINY, **options}))
+    assert len(seeds) == len(set(seeds)) == 6
+    assert betas[0] == pytest.approx(0.2 + 0.6 * 236 / 600) and betas[24] == 0.8 and sorted(betas[:25]) == betas[:25]
+    assert rewards[0].tolist() == [-1.0] * 4
+
+
 def test_finds_the_optimum_of_a_non_monotonic_game(tmp_path, monkeypatch):
     """Payoff 8 for (a, a), -12 beside it, 0 elsewhere: the average over what the other does speaks against a.
 
