@@ -502,7 +502,7 @@ def train(args):
     agents, mixer = learner["agents"], learner["mixer"]
     optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
     if args.resume:
-        folder, saved = Path(args.resume), load_file(args.resume, "checkpoint.pt")
+        folder, saved = Path(args.resume), load_file(args.resume, "checkpoint.pt", args.env)
         for name, part in (("learner", learner), ("target", target), ("optimizer", optimizer)):
             part.load_state_dict(saved[name])
         buffer.load(saved["buffer"])
@@ -523,7 +523,8 @@ def train(args):
         arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
         saved |= {"buffer": buffer.save(), "env": arrays, "hidden": hidden, "rng": rng.bit_generator.state}
         writer.flush()  # what was logged up to here is not logged again after a resume
-        save(saved | {"step": step, "updates": updates, "recent": recent, "models": models}, folder / "checkpoint.pt")
+        saved |= {"step": step, "updates": updates, "recent": recent, "models": models, "run": [ALGORITHM, args.env]}
+        save(saved, folder / "checkpoint.pt")
 
     # Ctrl-C and a termination signal take effect between two steps, where a checkpoint is whole; a second one at once.
     stop = []
@@ -593,7 +594,7 @@ def train(args):
                 writer.add_scalar(f"eval/{key}", value, step)
             model = {"step": step, "return": result["return"], "networks": copy.deepcopy(learner.state_dict())}
             models = {"last": model, "best": max(models.get("best", model), model, key=lambda m: m["return"])}
-            save(models, folder / "model.pt")
+            save({"run": [ALGORITHM, args.env], **models}, folder / "model.pt")
             bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
         if due[args.checkpoint_frequency]:
             save_checkpoint()
@@ -617,7 +618,7 @@ def report(args):
     check(args)
     torch.set_num_threads(args.torch_threads)
     env = envs.make(args.env, args.eval_episodes, render_mode="rgb_array" if args.gif else None)
-    (learner, _), model = make_learner(args, env), load_file(args.evaluate, "model.pt")[args.model]
+    (learner, _), model = make_learner(args, env), load_file(args.evaluate, "model.pt", args.env)[args.model]
     learner.load_state_dict(model["networks"])
     frames = [] if args.gif else None
     result = evaluate(learner["agents"], env, args.gamma, args.seed, frames)
@@ -664,14 +665,17 @@ def save(saved, path):
     os.replace(f"{path}.new", path)
 
 
-def load_file(folder, name):
-    """What `save` wrote in a run folder, on the CPU."""
+def load_file(folder, name, env_id):
+    """What `save` wrote in a run folder, on the CPU; it must be of this algorithm and task."""
     try:
-        return torch.load(Path(folder) / name, map_location="cpu", weights_only=True)
+        saved = torch.load(Path(folder) / name, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         fail(f"there is no {name} in {folder}")
     except Exception as error:  # torch names no common class for what a damaged file raises
         fail(f"{Path(folder) / name} is damaged: {str(error).splitlines()[0]}")
+    if saved["run"] != [ALGORITHM, env_id]:
+        fail(f"{Path(folder) / name} is of {' on '.join(saved['run'])}, not of {ALGORITHM} on {env_id}")
+    return saved
 
 
 def make_run_folder(args):

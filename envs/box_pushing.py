@@ -151,8 +151,8 @@ class BoxPushing(MacroVectorEnv):
             left, right = self.cell_x[WAYPOINT_BIG_LEFT], self.cell_x[WAYPOINT_BIG_RIGHT]
             placed = below & ((x == (left, right)).all(1) | (x == (right, left)).all(1))
         else:
-            first, second = self.last_waypoint[:, 0], self.last_waypoint[:, 1]
-            placed = (first + second == WAYPOINT_BIG_LEFT + WAYPOINT_BIG_RIGHT) & (np.abs(first - second) == 1)
+            # Waypoints are at most 3, so this sum is that of 2 and 3 only.
+            placed = self.last_waypoint.sum(1) == WAYPOINT_BIG_LEFT + WAYPOINT_BIG_RIGHT
         self.pushing_big |= both & placed
 
     def _outside(self, cell):

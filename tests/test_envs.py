@@ -242,3 +242,36 @@ def test_primitive_big_box_needs_both():
         _, reward, terminations, _, infos = env.step(np.array([[0, 0]]))
         total += reward[0]
     assert terminations[0] and infos["success"][0] and total == pytest.approx(100 - 0.4)
+
+
+def push(agent_start, orientation, steps=1, **arguments):
+    """Agent 0 pushes from a cell while agent 1 stays: the environment, the rewards and the last step's infos."""
+    env = envs.make("bp-10", agent_starts=[agent_start, (5.5, 0.5)], agent_orientations=(orientation, 0), **arguments)
+    env.reset(seed=0)
+    rewards = []
+    for _ in range(steps):
+        _, reward, _, _, infos = env.step(np.array([[4, 7]]))
+        rewards.append(round(reward[0], 6))
+    return env, rewards, infos
+
+
+def test_pushing_rules():
+    """The big box alone, small boxes from the side and walls cost a penalty and move nothing."""
+    for start, orientation in (((4.5, 4.5), 0), ((2.5, 5.5), 3), ((0.5, 5.5), 1), ((3.5, 5.5), 1), ((5.5, 0.5), 2)):
+        env, rewards, infos = push(start, orientation)
+        assert rewards == [-10.1] and infos["macro_done"][0, 0], (start, orientation)
+        assert env.position[0, 0].tolist() == list(start) and (env.box_y == 5.5).all()
+    env, rewards, infos = push((1.5, 4.5), 0, steps=4)
+    assert rewards == [-0.1, -0.1, -0.1, 9.9] and infos["macro_done"].all(), "small box 0 reaches the goal row"
+    assert env.box_y[0].tolist() == [9.5, 5.5, 5.5] and not infos["success"][0]
+
+
+def test_joint_push_needs_both_waypoints():
+    """Where the agents stand does not count, the last waypoint does; 2 and 2 do not do."""
+    env = envs.make("bp-10", 3)
+    env.reset(seed=0)
+    env.position[:], env.orientation[:] = [(4.5, 4.5), (5.5, 4.5)], 0
+    env.last_waypoint[:] = [(2, 3), (3, 2), (2, 2)]
+    _, rewards, _, _, infos = env.step(np.full((3, 2), 4))
+    assert rewards.round(6).tolist() == [-0.1, -0.1, -20.1]
+    assert env.box_y[:, 2].tolist() == [6.5, 6.5, 5.5] and infos["macro_done"].any(1).tolist() == [False, False, True]

@@ -59,6 +59,7 @@ def test_killed_and_resumed_equals_undisturbed(tmp_path, env_id, how):
         assert process.returncode == 0 and "stopped at step" in errors and f"--resume {folder}" in errors, errors
     cut_at = torch.load(folder / "checkpoint.pt", weights_only=True)["step"]
     assert cut_at < options["total_timesteps"], "the run was cut before its end"
+    time.sleep(1.1)  # TensorBoard orders event files by the second in which they were made
     assert train(parse_args([f"--resume={folder}"])) == folder
     one, other = (torch.load(f / "checkpoint.pt", weights_only=True) for f in (undisturbed, folder))
     assert one["step"] == other["step"] and one["updates"] == other["updates"] and one["rng"] == other["rng"]
@@ -189,7 +190,8 @@ def test_help_shows_the_defaults_in_force():
 def test_checkpoints_replace_the_old_one_at_once(tmp_path, monkeypatch):
     """A failure while writing leaves the old checkpoint whole."""
     path = tmp_path / "checkpoint.pt"
-    avf_qplex.save({"step": 1}, path)
+    saved = {"run": ["avf_qplex", "wtd-s"], "step": 1}
+    avf_qplex.save(saved, path)
 
     def broken(saved, file):
         Path(file).write_bytes(b"half")
@@ -198,4 +200,6 @@ def test_checkpoints_replace_the_old_one_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(torch, "save", broken)
     with pytest.raises(OSError, match="disk full"):
         avf_qplex.save({"step": 2}, path)
-    assert avf_qplex.load_file(tmp_path, "checkpoint.pt") == {"step": 1}
+    assert avf_qplex.load_file(tmp_path, "checkpoint.pt", "wtd-s") == saved
+    with pytest.raises(SystemExit, match="is of avf_qplex on wtd-s, not of avf_qplex on bp-10"):
+        avf_qplex.load_file(tmp_path, "checkpoint.pt", "bp-10")
