@@ -581,7 +581,8 @@ def train(args):
         signal.signal(number, handlers[number])
 
     handlers = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    bar = tqdm(total=args.total_timesteps, initial=step, disable=not sys.stderr.isatty(), dynamic_ncols=True)
+    layout = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=not sys.stderr.isatty(), bar_format=layout)
     started, first_step = time.time(), step
     while step < args.total_timesteps and not stop:
         # Choose and step
@@ -631,8 +632,8 @@ def train(args):
             for key, value in (("SPS", sps), ("epsilon", epsilon), ("episodic_return", mean_return)):
                 writer.add_scalar(f"charts/{key}", value, step)
             writer.add_scalar("charts/episodic_length", mean_length, step)
+            bar.set_postfix_str(f"return {mean_return:.1f}, epsilon {epsilon:.2f}, {sps:.0f} steps/s", refresh=False)
             bar.update(step - bar.n)
-            bar.set_postfix_str(f"return {mean_return:.1f}, epsilon {epsilon:.2f}, {sps:.0f} steps/s")
             recent = []
         if due[args.eval_frequency]:
             eval_seed = int(np.random.SeedSequence([args.seed, step]).generate_state(1)[0])
@@ -674,7 +675,7 @@ def report(args):
         error = value.std(ddof=1) / len(value) ** 0.5 if len(value) > 1 else float("nan")
         print(f"{key.replace('_', ' '):17s} {value.mean():9.3f} +- {error:.3f} (standard error)")
     if args.gif:
-        pictures = [Image.fromarray(frame).quantize(64) for frame in frames]
+        pictures = [Image.fromarray(frame).quantize(dither=0) for frame in frames]
         try:
             pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], duration=150, loop=0)
         except (OSError, ValueError) as error:
