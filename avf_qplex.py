@@ -581,7 +581,7 @@ def train(args):
         signal.signal(number, handlers[number])
 
     handlers = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    layout = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+    layout = "{percentage:3.0f}%|{bar:10}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
     bar = tqdm(total=args.total_timesteps, initial=step, disable=not sys.stderr.isatty(), bar_format=layout)
     started, first_step = time.time(), step
     while step < args.total_timesteps and not stop:
