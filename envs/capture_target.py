@@ -178,8 +178,7 @@ class CaptureTarget(MacroVectorEnv):
         self.target = (self.target + _HEADINGS[target_heading]) % self.grid
         captured = self._captured()
         self.visible = hidden >= self.flicker
-        # success is a copy: the next reset clears it in place, and not in the terminations that the caller holds
-        return captured * float(self.capture_reward), captured, ended, captured.copy()
+        return captured * float(self.capture_reward), captured, ended, captured
 
     def _nearest_heading(self, tie):
         """Heading int [N, n] to the cell nearest to the goal, one of equals by tie, uniform [N, n]; Stay if no goal."""

@@ -386,7 +386,7 @@ class Warehouse(MacroVectorEnv):
             np.copyto(self.has_next_tool, self.phase == PHASES - 1, where=begins)
         if self.primitive:
             ended[:] = True
-        return rewards, terminations, ended, terminations.copy()
+        return rewards, terminations, ended, terminations
 
     def _observe(self, start):
         if start:
