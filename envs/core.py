@@ -104,7 +104,7 @@ class MacroVectorEnv(VectorEnv, ABC):
             obs float32 [N, n, d] and infos (as `step`, with `macro_action` -1 for an agent that has not chosen yet).
 
         Raises:
-            ValueError: the mask has another shape or dtype, or leaves out an environment that was never reset.
+            ValueError: the mask has another shape or dtype.
         """
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
