@@ -121,8 +121,8 @@ class Args:
 # Where the environment families need other values; the README says how they were chosen.
 DEFAULTS = {
     "wtd": {},
-    "bp": dict(total_timesteps=800_000, gamma=0.95, learning_rate=3e-4, buffer_size=30_000,
-               exploration_timesteps=500_000, td_lambda=0.5, hysteresis_start=0.1),
+    "bp": dict(total_timesteps=800_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
+               td_lambda=0.5, hysteresis_start=0.1),
     "ct": dict(total_timesteps=1_000_000, gamma=0.98, buffer_size=10_000, exploration_timesteps=400_000, td_lambda=0.8,
                hysteresis_start=0.2, train_frequency=192, reward_scale=10.0, eval_episodes=100),
 }  # fmt: skip
