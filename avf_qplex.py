@@ -18,8 +18,8 @@ Numbered deviations from the paper:
  4. Rewards and values are discounted by gamma^tau between decision rows. An episode truncated by the horizon bootstraps
     from its final observation, a terminated one does not.
  5. Hyperparameters were chosen by measurement (DEFAULTS; the README says how and where they leave the paper). On Box
-    Pushing they include hysteretic TD errors and Q(lambda), which the paper does not use; --td-lambda 0
-    --hysteresis-start 1 is the paper's loss.
+    Pushing and Capture Target they include hysteretic TD errors and Q(lambda), which the paper does not use;
+    --td-lambda 0 --hysteresis-start 1 is the paper's loss.
 """
 
 # >>> imports, identical to avf_vdn.py
