@@ -484,7 +484,7 @@ def make_learner(args, env):
     agents = Agents(env.n_actions, env.single_observation_space.shape[1], args.hidden_size)
     width = env.state_size * (env.n_agents if args.mixer_state == "joint" else 1)
     mixer = QMIXMixer(env.n_agents, width, args.mixing_embed)
-    stored_hidden = args.hidden_size * (args.hidden_state == "stored")
+    stored_hidden = args.hidden_size if args.hidden_state == "stored" else 0
     buffer = ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state, stored_hidden)
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device), buffer
 
@@ -720,6 +720,8 @@ def parse_args(argv=None):
     for flag in ("--env", "--resume", "--evaluate"):
         peek.add_argument(flag)
     known = peek.parse_known_args(argv)[0]
+    if known.resume and known.evaluate:
+        fail("--resume and --evaluate exclude each other")
     folder = known.resume or known.evaluate
     base = load_args(folder) if folder else defaults(known.env or Args.env)
     args = tyro.cli(Args, default=base, args=argv)

@@ -531,7 +531,7 @@ def make_learner(args, env):
     width = env.state_size * (env.n_agents if args.mixer_state == "joint" else 1)
     options = dict(mask_ongoing=args.mask_ongoing, see_ongoing=args.see_ongoing, joint_action=not dueling)
     mixer = QPLEXMixer(env.n_actions, width, args.mixing_embed, **options)
-    stored_hidden = args.hidden_size * (args.hidden_state == "stored")
+    stored_hidden = args.hidden_size if args.hidden_state == "stored" else 0
     buffer = ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state, stored_hidden)
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device), buffer
 
@@ -767,6 +767,8 @@ def parse_args(argv=None):
     for flag in ("--env", "--resume", "--evaluate"):
         peek.add_argument(flag)
     known = peek.parse_known_args(argv)[0]
+    if known.resume and known.evaluate:
+        fail("--resume and --evaluate exclude each other")
     folder = known.resume or known.evaluate
     base = load_args(folder) if folder else defaults(known.env or Args.env)
     args = tyro.cli(Args, default=base, args=argv)

@@ -457,7 +457,7 @@ def evaluate(agents, env, gamma, seed, frames=None):
 def make_learner(args, env):
     """Agents and mixer as one module on the device, and the replay buffer."""
     agents = Agents(env.n_actions, env.single_observation_space.shape[1], args.hidden_size)
-    stored_hidden = args.hidden_size * (args.hidden_state == "stored")
+    stored_hidden = args.hidden_size if args.hidden_state == "stored" else 0
     buffer = ReplayBuffer(env, args.buffer_size, args.gamma, "decision", stored_hidden)
     return nn.ModuleDict({"agents": agents, "mixer": VDNMixer()}).to(args.device), buffer
 
@@ -693,6 +693,8 @@ def parse_args(argv=None):
     for flag in ("--env", "--resume", "--evaluate"):
         peek.add_argument(flag)
     known = peek.parse_known_args(argv)[0]
+    if known.resume and known.evaluate:
+        fail("--resume and --evaluate exclude each other")
     folder = known.resume or known.evaluate
     base = load_args(folder) if folder else defaults(known.env or Args.env)
     args = tyro.cli(Args, default=base, args=argv)

@@ -8,9 +8,9 @@ from envs.core import MacroVectorEnv
 NORTH = 0
 FORWARD = np.array([(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)])
 TURN_COST = np.array([np.roll([0.0, 0.1, 0.2, 0.1], turned) for turned in range(4)])  # [orientation, direction]
-GO_TO, PUSH, TURN_LEFT, TURN_RIGHT = range(4), 4, 5, 6
+PUSH, TURN_LEFT, TURN_RIGHT, STAY = 4, 5, 6, 7  # below: Go-to, numbered as the waypoints
 WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT = 2, 3
-PRIMITIVE_TO_MACRO = np.array([PUSH, TURN_LEFT, TURN_RIGHT, 7])
+PRIMITIVE_TO_MACRO = np.array([PUSH, TURN_LEFT, TURN_RIGHT, STAY])
 
 
 class BoxPushing(MacroVectorEnv):
@@ -163,7 +163,7 @@ class BoxPushing(MacroVectorEnv):
     def _box_ahead(self, front):
         """Whether the cell in front, [N, ..., (x, y)], holds each of the four box cells: bool [N, ..., 4]."""
         cell_y = self.box_y[:, self._cell_box]  # [N, 4]
-        cell_y = cell_y.reshape(self.num_envs, *[1] * (front.ndim - 2), 4)
+        cell_y = cell_y.reshape(self.num_envs, *[1] * (front.ndim - 2), 4)  # [N, 1 ..., 4]
         return (front[..., :1] == self.cell_x) & (front[..., 1:] == cell_y)
 
     def _push(self, agent, push, ended):
@@ -185,7 +185,7 @@ class BoxPushing(MacroVectorEnv):
 
     def _go_to(self, action, ended):
         """One step of Go-to for both agents: the cheapest neighbour cell by distance and turning."""
-        goes = action <= GO_TO[-1]
+        goes = action < PUSH
         target = np.where(goes, action, 0)
         waypoint = self.waypoints[target]  # [N, agents, (x, y)]
         to_go = np.abs(waypoint - self.position)
@@ -225,12 +225,13 @@ class BoxPushing(MacroVectorEnv):
 
     def _state(self):
         state = np.zeros((self.num_envs, self.state_size), np.float32)
-        agents = state[:, :12].reshape(self.num_envs, 2, 6)
+        agents = state[:, :12].reshape(self.num_envs, 2, 6)  # [N, agents, (x, y, orientation)]
         agents[..., :2] = self.position / self.grid
         agents[..., 2:] = np.eye(4)[self.orientation]
         state[:, 12:18:2] = self._boxes[:, 0] / self.grid
         state[:, 13:18:2] = self.box_y / self.grid
-        state[:, 18:26].reshape(self.num_envs, 2, 4)[:] = np.eye(5)[self.last_waypoint, :4]
+        waypoints = state[:, 18:26].reshape(self.num_envs, 2, 4)  # [N, agents, waypoints]
+        waypoints[:] = np.eye(5)[self.last_waypoint, :4]
         state[:, 26] = self.pushing_big
         return state
 

@@ -132,6 +132,7 @@ def test_evaluate_prints_and_animates(tmp_path, capsys):
         (["--device=abacus"], "--device abacus is not available"),
         (["--resume=nowhere"], "nowhere is not a run folder"),
         (["--evaluate=nowhere"], "nowhere is not a run folder"),
+        (["--evaluate=here", "--resume=there"], "--resume and --evaluate exclude each other"),
     ],
 )
 def test_bad_arguments_are_told_in_one_line(tmp_path, arguments, message):
