@@ -175,6 +175,14 @@ class Agents(nn.Module):
         self.register_buffer("actions", torch.arange(widest), persistent=False)
         self.register_buffer("padding", self.actions >= torch.tensor(n_actions)[:, None, None], persistent=False)
 
+    def start(self, count):
+        """The recurrent states before the first decisions of count episodes: zeros, float32 [n, count, H]."""
+        return self.gru_hidden.new_zeros(len(self.gru_hidden), count, self.hidden_size)
+
+    def inputs(self, obs, previous):
+        """Macro-observations and the one-hot macro-actions before them: [n, M, d + A]."""
+        return torch.cat([obs, (previous[..., None] == self.actions).float()], 2)
+
     def forward(self, obs, previous, hidden, sizes):
         """Runs sequences packed step by step: sizes[t] entries of step t, those of the longest sequences first.
 
@@ -185,10 +193,9 @@ class Agents(nn.Module):
         Returns:
             utilities float32 [n, M, A] (-inf for padding actions), values V_i float32 [n, M], states float32 [n, M, H].
         """
-        one_hot = (previous[..., None] == self.actions).float()  # [agents, M, actions]
-        gates = self.gru_input(F.relu(self.encoder(torch.cat([obs, one_hot], 2))))  # [agents, M, 3 hidden]
+        gates = self.gru_input(F.relu(self.encoder(self.inputs(obs, previous))))  # [agents, M, 3 hidden]
         if hidden is None:
-            hidden = obs.new_zeros(len(obs), sizes[0], self.hidden_size)
+            hidden = self.start(sizes[0])
         states = []
         for step in gates.split(sizes, 1):
             hidden = hidden[:, : step.shape[1]]
@@ -360,11 +367,14 @@ class ReplayBuffer:
 
     def sample(self, batch_size, window, rng, device="cpu"):
         """A Batch of windows, each from a random episode and a random row of it; a short episode starts at row 0."""
-        data, agents = self.data, np.arange(self.data["decisions"].shape[1])
         episode = rng.integers(self.size, size=batch_size)
-        final = data["rows"][episode] - 1  # the row of the final observation
-        start = rng.integers(np.maximum(final - window, 0) + 1)
-        end = np.minimum(start + window, final)
+        start = rng.integers(np.maximum(self.data["rows"][episode] - 1 - window, 0) + 1)
+        return self.windows(episode, start, window, device)
+
+    def windows(self, episode, start, window, device="cpu"):
+        """The Batch of the windows that start at these rows of these episodes, int [B] each."""
+        data, agents, batch_size = self.data, np.arange(self.data["decisions"].shape[1]), len(episode)
+        end = np.minimum(start + window, data["rows"][episode] - 1)  # the last row is that of the final observation
 
         # Each agent's own decisions: from its latest one at the first row, which may precede it, to that at the last
         first, last = data["latest"][episode, start].astype(int), data["latest"][episode, end]  # [B, agents]
@@ -467,6 +477,15 @@ def td_loss(utilities, values, target_utilities, target_values, mixer, target_mi
     return torch.where(error < 0, hysteresis * error, error).square().mean(), q, target
 
 
+def batch_loss(learner, target, batch, td_lambda, hysteresis):
+    """`td_loss` of a learner and its target network on a batch: the loss and the joint values [R]."""
+    history = (batch.obs, batch.previous, batch.hidden, batch.sizes)
+    with torch.no_grad():
+        next_q, next_v, _ = target["agents"](*history)  # over the same rows, so that it has the same histories
+    q, v, _ = learner["agents"](*history)
+    return td_loss(q, v, next_q, next_v, learner["mixer"], target["mixer"], batch, td_lambda, hysteresis)[:2]
+
+
 # <<< td loss
 
 
@@ -492,6 +511,10 @@ def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
     return np.where(free, actions, running), torch.where(by_agent[2][..., None], states, hidden)
 
 
+# <<< acting
+
+
+# >>> evaluation, identical to avf_vdn.py
 def evaluate(agents, env, gamma, seed, frames=None):
     """Greedy play: the first episode of each environment of a batch, reset with the seed.
 
@@ -499,7 +522,7 @@ def evaluate(agents, env, gamma, seed, frames=None):
     pictures of environment 0.
     """
     obs, infos = env.reset(seed=seed)
-    hidden = torch.zeros(env.n_agents, env.num_envs, agents.hidden_size, device=agents.actions.device)
+    hidden = agents.start(env.num_envs)
     result = {key: np.zeros(env.num_envs) for key in ("return", "discounted_return", "length", "success")}
     live, step = np.ones(env.num_envs, bool), 0
     if frames is not None:
@@ -521,7 +544,7 @@ def evaluate(agents, env, gamma, seed, frames=None):
     return result
 
 
-# <<< acting
+# <<< evaluation
 
 
 def make_learner(args, env):
@@ -546,7 +569,7 @@ def train(args):
     env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
     learner, buffer = make_learner(args, env)
     target = copy.deepcopy(learner).requires_grad_(False)
-    agents, mixer = learner["agents"], learner["mixer"]
+    agents = learner["agents"]
     optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
     if args.resume:
         folder, saved = Path(args.resume), load_file(args.resume, "checkpoint.pt", args.env)
@@ -559,7 +582,7 @@ def train(args):
     else:
         folder = make_run_folder(args)
         obs, infos = env.reset(seed=args.seed)
-        hidden = torch.zeros(env.n_agents, args.num_envs, args.hidden_size, device=args.device)
+        hidden = agents.start(args.num_envs)
         step, updates, recent, models = 0, 0, [], {}
     writer = SummaryWriter(folder, purge_step=step + 1)
     table = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
@@ -603,15 +626,13 @@ def train(args):
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
 
+        # <<< training
+        # >>> learning, identical to avf_vdn.py
         # Learn
         while updates < (step - args.learning_starts) // args.train_frequency and buffer.size:
             batch = buffer.sample(args.batch_size, args.window, rng, args.device)
-            history = (batch.obs, batch.previous, batch.hidden, batch.sizes)
-            with torch.no_grad():
-                next_q, next_v, _ = target["agents"](*history)
-            q, v, _ = agents(*history)
             beta = args.hysteresis_start + progress * (args.hysteresis_end - args.hysteresis_start)
-            loss, joint_q, _ = td_loss(q, v, next_q, next_v, mixer, target["mixer"], batch, args.td_lambda, beta)
+            loss, joint_q = batch_loss(learner, target, batch, args.td_lambda, beta)
             optimizer.zero_grad()
             loss.backward()
             grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
@@ -624,6 +645,8 @@ def train(args):
                 writer.add_scalar("losses/q_values", joint_q.mean().item(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm.item(), step)
 
+        # <<< learning
+        # >>> logging, identical to avf_vdn.py
         # Log, evaluate, save
         due = {f: step // f > (step - args.num_envs) // f or step >= args.total_timesteps
                for f in (2_000, args.eval_frequency, args.checkpoint_frequency)}  # fmt: skip
@@ -657,7 +680,7 @@ def train(args):
     return folder
 
 
-# <<< training
+# <<< logging
 
 
 # >>> runs, identical to avf_vdn.py
