@@ -10,14 +10,28 @@ def test_shared_blocks_are_identical():
     assert not difference, f"python tests/sync.py rewrites the copies from their source:\n{difference}"
 
 
+COMMON = {"imports", "run arguments", "agents", "replay", "evaluation", "training", "logging", "runs"}
+Q_LEARNING = {"learning arguments", "learning"}
+SHARED = {
+    "avf_vdn.py": COMMON | Q_LEARNING | {"td loss", "acting"},
+    "avf_qmix.py": COMMON | Q_LEARNING | {"td loss", "acting"},
+    "avf_qplex.py": COMMON | Q_LEARNING | {"td loss", "acting"},
+    "cen_maddrqn.py": COMMON | Q_LEARNING | {"td loss", "team"},
+    "dec_maddrqn.py": COMMON | Q_LEARNING | {"acting", "team", "joint history"},
+    "mac_iaicc.py": COMMON | {"joint history"},
+}
+
+
 def test_the_scripts_share_what_they_should():
     """What is left of avf_qmix.py and avf_vdn.py outside the blocks is short: docstring, defaults and mixer."""
-    for name, text in scripts().items():
+    texts = scripts()
+    assert {name: {match[1] for match in BLOCK.finditer(text)} for name, text in texts.items()} == SHARED
+    for text in texts.values():
         blocks = {match[1]: match[2] for match in BLOCK.finditer(text)}
-        assert {"imports", "agents", "replay", "td loss", "training", "runs"} <= blocks.keys(), name
-        assert set(blocks.values()) == {"avf_vdn.py"}
-    assert len(BLOCK.sub("", scripts()["avf_vdn.py"]).splitlines()) < 100
-    assert len(BLOCK.sub("", scripts()["avf_qmix.py"]).splitlines()) < 150
+        expected = {"team": "cen_maddrqn.py", "joint history": "dec_maddrqn.py"}
+        assert blocks == {name: expected.get(name, "avf_vdn.py") for name in blocks}
+    assert len(BLOCK.sub("", texts["avf_vdn.py"]).splitlines()) < 100
+    assert len(BLOCK.sub("", texts["avf_qmix.py"]).splitlines()) < 150
 
 
 def test_drift_is_seen_and_repaired():
