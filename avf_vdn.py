@@ -20,6 +20,7 @@ Numbered deviations from the paper:
 # >>> imports, identical to avf_vdn.py
 import argparse
 import copy
+import importlib.util
 import json
 import os
 import signal
@@ -75,6 +76,12 @@ class Args:
     """with --evaluate: the model of the best greedy evaluation or of the last one"""
     gif: str | None = None
     """with --evaluate: file for an animation of one episode"""
+    track: bool = False
+    """log to Weights & Biases too, which needs the extra `track`; with WANDB_MODE=offline no account"""
+    wandb_project_name: str = "avf"
+    """with --track: the project there"""
+    wandb_entity: str | None = None
+    """with --track: the team there"""
     # <<< run arguments
 
     # >>> learning arguments, identical to avf_vdn.py
@@ -118,7 +125,7 @@ class Args:
     # <<< learning arguments
 
 
-# Where the environment families need other values; the README says how they were chosen.
+# Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
     "wtd": {},
     "bp": dict(total_timesteps=800_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
@@ -510,6 +517,7 @@ def train(args):
         obs, infos = env.reset(seed=args.seed)
         hidden = agents.start(args.num_envs)
         step, updates, recent, models = 0, 0, [], {}
+    tracker = start_tracking(args, folder) if args.track else None
     writer = SummaryWriter(folder, purge_step=step + 1)
     table = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
     writer.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}", step)
@@ -603,6 +611,8 @@ def train(args):
         save_checkpoint()
         print(f"stopped at step {step}; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
     writer.close()
+    if tracker:
+        tracker.finish()
     return folder
 
 
@@ -650,10 +660,20 @@ def check(args):
             fail(f"{name} must not be negative, got {value}")
         if type(value) is int and field.name not in from_zero and value < 1:
             fail(f"{name} must be at least 1, got {value}")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        fail("--track needs Weights & Biases: pip install -e '.[track]'")
     try:
         torch.zeros(1, device=args.device)
     except (RuntimeError, AssertionError) as error:
         fail(f"--device {args.device} is not available: {str(error).splitlines()[0]}")
+
+
+def start_tracking(args, folder):
+    """A Weights & Biases run that copies what is written to TensorBoard; a resumed run goes on in its own."""
+    import wandb  # optional
+
+    return wandb.init(project=args.wandb_project_name, entity=args.wandb_entity, name=folder.name, id=folder.name,
+                      resume="allow", config=asdict(args), sync_tensorboard=True, dir=folder.parent)  # fmt: skip
 
 
 def save(saved, path):
@@ -721,7 +741,7 @@ def parse_args(argv=None):
     folder = known.resume or known.evaluate
     base = load_args(folder) if folder else defaults(known.env or Args.env)
     args = tyro.cli(Args, default=base, args=argv)
-    may_change = {"resume", "evaluate", "device", "torch_threads"}
+    may_change = {"resume", "evaluate", "device", "torch_threads", "track", "wandb_project_name", "wandb_entity"}
     evaluation, training = {"eval_episodes", "gif", "model", "seed"}, {"total_timesteps", "checkpoint_frequency"}
     may_change |= evaluation if args.evaluate else training
     for field in fields(Args):

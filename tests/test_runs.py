@@ -1,5 +1,6 @@
 """Run folders, checkpoints and the command line of the scripts, in processes of their own where one is killed."""
 
+import importlib.util
 import json
 import os
 import re
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -174,6 +176,27 @@ def test_folders_of_other_runs_are_refused(tmp_path):
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "checkpoint.pt"} == {
         name: content for name, content in before.items() if name not in ("checkpoint.pt", "model.pt")
     }
+
+
+def test_track_copies_the_curves(tmp_path, monkeypatch):
+    """With a stand-in for wandb, which is optional: what it is told, and the one line where it is missing."""
+    calls = []
+    tracker = types.SimpleNamespace(finish=lambda: calls.append("finish"))
+    module = types.ModuleType("wandb")
+    module.init = lambda **options: calls.append(options) or tracker
+    module.__spec__ = importlib.util.spec_from_loader("wandb", loader=None)
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    options = {**TINY, "total_timesteps": 400, "runs_dir": str(tmp_path), "track": True, "wandb_project_name": "mine"}
+    folder = train(defaults("wtd-s", **options))
+    train(parse_args([f"--resume={folder}", "--total-timesteps=800"]))
+    told, finished, again, _ = calls
+    assert finished == "finish" and told["project"] == "mine" and told["sync_tensorboard"] and told["config"]["track"]
+    assert told["id"] == again["id"] == folder.name and told["resume"] == "allow"
+    monkeypatch.undo()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit, match=re.escape("--track needs Weights & Biases: pip install -e '.[track]'")):
+        train(defaults("wtd-s", **options))
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_help_shows_the_defaults_in_force():
