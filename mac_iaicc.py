@@ -307,13 +307,17 @@ class ReplayBuffer:
         self.size, self.next = min(self.size + len(env), self.capacity), (self.next + len(env)) % self.capacity
 
     def sample(self, batch_size, window, rng, device="cpu"):
-        """A Batch of windows, each from a random episode and a random row of it; a short episode starts at row 0."""
+        """A Batch of windows, each from a random episode, in which every row of the episode is as likely as any other.
+
+        Windows therefore reach over both ends of the episode and are cut there: had all of them to fit in, the first
+        row and the last, which often has the reward, would be in one of final - window + 1 only.
+        """
         episode = rng.integers(self.size, size=batch_size)
-        start = rng.integers(np.maximum(self.data["rows"][episode] - 1 - window, 0) + 1)
-        return self.windows(episode, start, window, device)
+        start = rng.integers(1 - window, self.data["rows"][episode] - 1)
+        return self.windows(episode, np.maximum(start, 0), np.minimum(start, 0) + window, device)
 
     def windows(self, episode, start, window, device="cpu"):
-        """The Batch of the windows that start at these rows of these episodes, int [B] each."""
+        """The Batch of windows of these episodes from these rows on, int [B] each; window: their rows, int or [B]."""
         data, agents, batch_size = self.data, np.arange(self.data["decisions"].shape[1]), len(episode)
         end = np.minimum(start + window, data["rows"][episode] - 1)  # the last row is that of the final observation
 
@@ -337,7 +341,7 @@ class ReplayBuffer:
             hidden[agents, rank] = data["hidden"][episode[:, None], agents, first]
 
         # The joint rows
-        valid = start[:, None] + np.arange(window) < end[:, None]  # [B, W]
+        valid = start[:, None] + np.arange(np.max(end - start)) < end[:, None]  # [B, W]
         b, k = np.nonzero(valid)  # [R] each
         episode, row = episode[b], start[b] + k
         latest, next_latest = data["latest"][episode, row], data["latest"][episode, row + 1]  # [R, agents]

@@ -149,6 +149,26 @@ def test_windows_never_mix_episodes():
     assert checked > 1000 and tag.max() > 20
 
 
+def test_every_row_of_an_episode_is_replayed_equally_often():
+    """The first and the last too, where the reward often is: were all windows to fit in, one start in 15 would do."""
+    env = envs.make("bp-10", 2)
+    buffer, hidden, obs = ReplayBuffer(env, 4, 0.9), torch.zeros(2, 2, 0), np.zeros((2, 2, 5), np.float32)
+    for t in range(20):
+        buffer.decide(np.ones((2, 2), bool), obs, np.zeros((2, 2), int), np.zeros((2, 27), np.float32), hidden)
+        buffer.reward(np.full(2, t), None)
+        ends = np.array([t == 19, t == 3])  # episodes of 20 rows and of 4, the second followed by another of 16
+        if ends.any():
+            buffer.finish(ends, ends, obs, np.zeros((2, 27), np.float32), hidden)
+    assert buffer.data["rows"][:2].tolist() == [5, 21]
+    batch = buffer.sample(24_000, 6, np.random.default_rng(0))
+    windows = batch.valid.sum(1)
+    assert windows.min() == 1 and windows.max() == 6
+    counts = np.bincount(batch.reward.numpy().astype(int), minlength=20)
+    # half of the windows are of each episode; 6 starts of 25 reach a row of the long one, 6 of 9 one of the short one
+    expected = 12_000 * 6 / 25 + (np.arange(20) < 4) * 12_000 * 6 / 9
+    assert np.abs(counts - expected).max() < 5 * np.sqrt(expected.max()), counts
+
+
 @pytest.mark.parametrize("mixer_state", ["joint", "single", "real", "decision"])
 def test_mixer_state_feeds_the_rows_it_says(mixer_state):
     """Two agents, decisions worked out by hand; the state is the time step.
@@ -170,7 +190,7 @@ def test_mixer_state_feeds_the_rows_it_says(mixer_state):
         buffer.decide(np.array([free[t]]), obs, np.zeros((1, 2), int), state(t), hidden)
         buffer.reward(np.zeros(1), state(t))
     buffer.finish(np.array([True]), np.array([False]), obs, state(5), hidden)
-    batch = buffer.sample(1, 5, np.random.default_rng(0))
+    batch = buffer.windows(np.array([0]), np.array([0]), 5)
     got = batch.state.reshape(5, -1, env.state_size)[..., 0].tolist()
     later = batch.next_state.reshape(5, -1, env.state_size)[..., 0].tolist()
     # joint: when each agent last chose. single: that of the agent whose macro-action ends with the row's interval,
@@ -193,7 +213,7 @@ def test_real_state_is_that_of_the_last_step_of_the_interval():
         buffer.decide(np.full((1, 2), t in (0, 4)), obs, np.zeros((1, 2), int), np.full((1, 27), t, np.float32), hidden)
         buffer.reward(np.zeros(1), np.full((1, 27), t, np.float32))
     buffer.finish(np.array([True]), np.array([True]), obs, np.full((1, 27), 6, np.float32), hidden)
-    batch = buffer.sample(1, 5, np.random.default_rng(0))
+    batch = buffer.windows(np.array([0]), np.array([0]), 5)
     assert batch.state[:, 0].tolist() == [3, 5] and batch.next_state[:, 0].tolist() == [4, 6]
 
 
