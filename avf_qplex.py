@@ -143,7 +143,7 @@ class Args:
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
     "wtd": {},
-    "bp": dict(total_timesteps=800_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
+    "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
                td_lambda=0.5, hysteresis_start=0.1),
     "ct": dict(total_timesteps=1_000_000, gamma=0.98, buffer_size=10_000, exploration_timesteps=400_000, td_lambda=0.8,
                hysteresis_start=0.2, train_frequency=192, reward_scale=10.0, eval_episodes=100),

@@ -135,7 +135,7 @@ class Args:
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
     "wtd": dict(hysteresis_start=0.2, hysteresis_end=0.4),
-    "bp": dict(total_timesteps=800_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
+    "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
                hysteresis_start=0.2, hysteresis_end=0.4),
     "ct": dict(total_timesteps=1_000_000, gamma=0.98, buffer_size=10_000, exploration_timesteps=400_000,
                hysteresis_start=0.2, hysteresis_end=0.4, train_frequency=192, reward_scale=10.0, eval_episodes=100),
