@@ -90,6 +90,8 @@ class Args:
     # Algorithm
     learning_rate: float = 5e-4
     """Adam's step size"""
+    learning_rate_end: float | None = None
+    """step size at total_timesteps, reached linearly; None keeps it constant"""
     gamma: float = 0.99
     """discount per environment step, in [0, 1]"""
     buffer_size: int = 2_500
@@ -114,6 +116,8 @@ class Args:
     """the gradient is scaled down to this norm"""
     reward_scale: float = 1.0
     """factor on rewards inside the loss; logged returns are unscaled"""
+    obs_scale: float = 1.0
+    """factor on macro-observations and states where they enter a network; more resolves small differences"""
     td_lambda: float = 0.0
     """lambda of Q(lambda) returns over a window; 0 is the paper's one-row target"""
     hysteresis_start: float = 1.0
@@ -154,11 +158,12 @@ class AgentLinear(nn.Module):
 class Agents(nn.Module):
     """The agents' utility networks, one each: Linear, ReLU, GRU, Linear, ReLU, Linear.
 
-    n_actions: a list of n ints. obs_size: width d of the padded macro-observation.
+    n_actions: a list of n ints. obs_size: width d of the padded macro-observation, which is multiplied by obs_scale.
     """
 
-    def __init__(self, n_actions, obs_size, hidden_size):
+    def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
+        self.obs_scale = obs_scale
         n, widest, bound = len(n_actions), max(n_actions), hidden_size**-0.5
         self.n_actions, self.hidden_size = np.array(n_actions), hidden_size
         self.encoder = AgentLinear(n, obs_size + widest, hidden_size)
@@ -175,7 +180,7 @@ class Agents(nn.Module):
 
     def inputs(self, obs, previous):
         """Macro-observations and the one-hot macro-actions before them: [n, M, d + A]."""
-        return torch.cat([obs, (previous[..., None] == self.actions).float()], 2)
+        return torch.cat([self.obs_scale * obs, (previous[..., None] == self.actions).float()], 2)
 
     def forward(self, obs, previous, hidden, sizes):
         """Runs sequences packed step by step: sizes[t] entries of step t, those of the longest sequences first.
@@ -215,9 +220,9 @@ class Team(Agents):
     observation is that of all agents and who is free, n * d + n numbers.
     """
 
-    def __init__(self, n_actions, obs_size, hidden_size):
+    def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
         digits = np.indices(n_actions).reshape(len(n_actions), -1).T  # [joint, agents]
-        super().__init__([len(digits)], 0, hidden_size)
+        super().__init__([len(digits)], 0, hidden_size, obs_scale)
         self.digits, self.strides = digits, np.cumprod([1, *n_actions[:0:-1]])[::-1].copy()
         columns = np.arange(sum(n_actions)) - np.repeat(np.cumsum(n_actions) - n_actions, n_actions)
         self.owner = np.repeat(np.arange(len(n_actions)), n_actions)  # [sum of actions], the agent of each column
@@ -227,7 +232,7 @@ class Team(Agents):
 
     def inputs(self, obs, previous):
         """The team's observations and the macro-actions before them, one-hot for each agent, zeros for none (-1)."""
-        return torch.cat([obs, self.one_hot[previous]], 2)
+        return torch.cat([self.obs_scale * obs, self.one_hot[previous]], 2)
 
     def forward(self, obs, previous, hidden, sizes):
         """As `Agents.forward` with n = 1, previous being joint macro-actions. Joint macro-actions that would change
@@ -289,10 +294,12 @@ class ReplayBuffer:
     end: a window cannot reach into another episode.
 
     capacity: episodes kept. hidden_size: width of the recurrent states stored with the decisions, 0 for none.
+    state_scale: factor on the states of a batch.
     """
 
-    def __init__(self, env, capacity, gamma, mixer_state="joint", hidden_size=0):
+    def __init__(self, env, capacity, gamma, mixer_state="joint", hidden_size=0, state_scale=1.0):
         self.capacity, self.gamma, self.mixer_state, self.hidden_size = capacity, gamma, mixer_state, hidden_size
+        self.state_scale = state_scale
         n, rows, real = env.n_agents, env.horizon + 1, env.state_size * (mixer_state == "real")
         obs_size = env.single_observation_space.shape[1]
         self.per_decision = {"obs": (obs_size,), "action": (), "row": (), "hidden": (hidden_size,)}
@@ -397,6 +404,7 @@ class ReplayBuffer:
             state = data["state"][episode, own_row[np.arange(len(row)), next_chosen.argmax(1)]]
         else:
             state = data["last_state" if self.mixer_state == "real" else "state"][episode, row]
+        state, next_state = np.float32(self.state_scale) * state, np.float32(self.state_scale) * next_state
         batch = Batch(obs, previous, action, hidden, sizes.tolist(), entry, next_entry, chosen, next_chosen, state,
                       next_state, data["reward"][episode, row], data["discount"][episode, row], valid)  # fmt: skip
         return Batch(*(torch.from_numpy(x).to(device) if isinstance(x, np.ndarray) else x for x in batch))
@@ -549,7 +557,7 @@ def make_learner(args, env):
     """The team's network in a module on the device, and the replay buffer."""
     if np.prod(env.n_actions, dtype=float) > 2**15:
         fail(f"{args.env} has {np.prod(env.n_actions, dtype=float):,.0f} joint macro-actions, the limit is {2**15:,}")
-    team = Team(env.n_actions, env.single_observation_space.shape[1], args.hidden_size)
+    team = Team(env.n_actions, env.single_observation_space.shape[1], args.hidden_size, args.obs_scale)
     stored_hidden = args.hidden_size if args.hidden_state == "stored" else 0
     buffer = TeamBuffer(env, team, args.buffer_size, args.gamma, stored_hidden)
     return nn.ModuleDict({"agents": team, "mixer": NoMixer()}).to(args.device), buffer
@@ -608,6 +616,11 @@ def train(args):
         # Choose and step
         progress = min(1.0, step / args.exploration_timesteps)
         epsilon = args.start_e + progress * (args.end_e - args.start_e)
+        if args.learning_rate_end is not None:
+            rest = 1 - step / args.total_timesteps
+            optimizer.param_groups[0]["lr"] = args.learning_rate_end + rest * (
+                args.learning_rate - args.learning_rate_end
+            )
         actions, moved = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.decide(infos["macro_done"], obs, actions, state, hidden)
@@ -714,12 +727,12 @@ def check(args):
     if args.env not in envs.IDS:
         fail(f"unknown --env {args.env!r}; valid ids: {' '.join(envs.IDS)}")
     zero_to_one = "gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end".split()
-    from_zero = ["seed", "learning_starts", "learning_rate", "max_grad_norm", "reward_scale"]
+    from_zero = "seed learning_starts learning_rate learning_rate_end max_grad_norm reward_scale obs_scale".split()
     for field in fields(args):
         value, name = getattr(args, field.name), "--" + field.name.replace("_", "-")
         if field.name in zero_to_one and not 0 <= value <= 1:
             fail(f"{name} must be between 0 and 1, got {value}")
-        if field.name in from_zero and not 0 <= value < float("inf"):
+        if field.name in from_zero and value is not None and not 0 <= value < float("inf"):
             fail(f"{name} must not be negative, got {value}")
         if type(value) is int and field.name not in from_zero and value < 1:
             fail(f"{name} must be at least 1, got {value}")

@@ -12,14 +12,17 @@ class MatrixGame(MacroVectorEnv):
 
     Agent 0's macro-actions last one step and agent 1's three: agent 0 chooses twice more, to no effect, while agent 1's
     choice is ongoing. The state tells the step.
+
+    tell: from the second step on, macro-observations and state tell what was chosen at the reset. Without that, the
+    later rows have to value what only the histories hold by a mixer that sees the step alone.
     """
 
     sim_arrays = ("first_choice",)
 
-    def __init__(self, num_envs=1, payoff=NON_MONOTONIC, render_mode=None):
-        names = [["a", "b", "c"]] * 2
-        super().__init__(num_envs, names, np.zeros((2, 3)), np.ones((2, 3)), (3, 3), 3, 10, render_mode)
-        self.payoff, self.first_choice = payoff, np.zeros((num_envs, 2), int)
+    def __init__(self, num_envs=1, payoff=NON_MONOTONIC, tell=False, render_mode=None):
+        names, width = [["a", "b", "c"]] * 2, 9 if tell else 3
+        super().__init__(num_envs, names, np.zeros((2, width)), np.ones((2, width)), (3, 3), width, 10, render_mode)
+        self.payoff, self.tell, self.first_choice = np.array(payoff, float), tell, np.zeros((num_envs, 2), int)
 
     def _reset(self, mask):
         self.first_choice[mask] = 0
@@ -35,7 +38,11 @@ class MatrixGame(MacroVectorEnv):
         return np.repeat(self._state()[:, None], 2, 1)
 
     def _state(self):
-        return np.eye(4, dtype=np.float32)[np.minimum(self.elapsed, 3), :3]
+        step = np.eye(4, dtype=np.float32)[np.minimum(self.elapsed, 3), :3]
+        if not self.tell:
+            return step
+        chosen = np.eye(3, dtype=np.float32)[self.first_choice].reshape(self.num_envs, 6)
+        return np.concatenate([step, chosen * (self.elapsed > 0)[:, None]], 1)
 
     def _draw(self, index):
         raise NotImplementedError

@@ -39,6 +39,24 @@ def test_the_box_is_pushed_on_other_grids(env_id, grid):
     np.testing.assert_allclose(env.episode_return, 100 - 0.1 * (1.5 * grid - 4))
 
 
+@pytest.mark.parametrize("env_id", ["bp-10", "bp-10-primitive"])
+def test_a_robot_that_is_there_first_waits(env_id):
+    env = envs.make(env_id, agent_starts=[(3.5, 4.5), (8.5, 1.5)])
+    _, infos = env.reset(seed=0)
+    while not env.over.any():
+        _, _, _, _, infos = env.step(script_of(env_id)[1](env, infos, None))
+    np.testing.assert_allclose(env.episode_return, 98.9)
+
+
+@pytest.mark.parametrize("layout", LOADS)
+def test_the_arm_finishes_what_it_began_with_primitive_actions(layout):
+    env = envs.make(f"wtd-{layout}", primitive=True)
+    _, infos = env.reset(seed=0)
+    while not env.over.any():
+        _, _, _, _, infos = env.step(deliver(env, infos, None, LOADS[layout]))
+    np.testing.assert_allclose(env.episode_return, OPTIMA[f"wtd-{layout}"])
+
+
 @pytest.mark.parametrize("env_id", ["wtd-t", "wtd-s-primitive", "bp-10"])
 def test_environments_out_of_step_do_not_disturb_each_other(env_id):
     env, policy, returns = envs.make(env_id, 3), script_of(env_id)[1], []
@@ -94,6 +112,13 @@ def test_references_are_those_of_the_code(env_id):
             error = saved["se"] * (1 + saved["episodes"] / few) ** 0.5
             assert abs(got["return"] - saved["return"]) < 4 * error
     assert entry["random"]["return"] < entry["scripted"]["return"]
+
+
+def test_means_and_standard_error():
+    result, got = (f("wtd-s", random_policy, 50, seed=3, gamma=0.99) for f in (play, reference))
+    for key, values in result.items():
+        assert got[key] == pytest.approx(values.mean(), abs=1e-6), key
+    assert got["se"] == pytest.approx(np.sqrt(np.square(result["return"] - got["return"]).sum() / 49 / 50), abs=1e-5)
 
 
 def test_all_tasks_have_references():

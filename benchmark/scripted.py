@@ -1,0 +1,197 @@
+"""What a learner is compared with: the random policy (the floor) and a policy written by hand (the ceiling).
+
+    python benchmark/scripted.py                                   a table, all tasks
+    python benchmark/scripted.py -o benchmark/references.json      and the file that benchmark/report.py reads
+
+The scripts see the whole simulator. What they reach, and what can be reached at all:
+
+- Box Pushing: both robots walk to the big box at once and push it. That is the shortest way, so the return is the
+  optimum: 100 - 0.1 (1.5 g - 4) on a g x g grid.
+- Warehouse: the arm hands out the tools in a fixed order and each robot takes a fixed load to the humans, `LOADS`.
+  These loads were found by a search over such plans and are optimal, since no episode that delivers every tool ends
+  earlier. wtd-s: its human begins the third phase in step 40, so the last tool cannot be given before step 41, and
+  300 - 41 = 259. The other layouts: the arm needs 10 steps a tool and a robot 7 more to the nearest human, so the last
+  of 6 or 9 tools arrives in step 67 or 97 at the earliest, and 600 - 67 = 533, 900 - 97 = 803. (Optimal for the
+  undiscounted return: nobody has looked for the best discounted one.)
+- Capture Target: "always Move-to-T" is not optimal, only simple. With primitive actions every agent walks towards the
+  target, which the script sees all the time and the agents do not.
+
+A policy is a function of (env, infos, rng) that gives the macro-actions, int [N, n], of a batch of N environments with
+n agents; rng is a NumPy generator. Entries of agents that are not free do not matter.
+"""
+
+import argparse
+import json
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script, Python looks in this folder only
+
+import envs
+from envs.box_pushing import NORTH, PUSH, STAY, WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT
+
+# The discounts that the algorithm scripts use for a family, so that discounted returns can be put side by side.
+GAMMA = {"bp": 0.95, "wtd": 0.99, "ct": 0.98}
+
+# For each layout the loads in the order in which the arm hands them out: a robot, and the humans to whom it then goes.
+# A human gets its tools in the order in which it needs them. Three robots can always take one tool at a time, in turn.
+LOADS = {
+    "s": [(1, [0]), (0, [0]), (1, [0])],
+    "d": [(0, [0]), (1, [1]), (0, [0]), (1, [1]), (0, [0]), (1, [1])],
+    "t": [(0, [0]), (1, [1]), (0, [2]), (1, [0, 2]), (0, [1]), (1, [2, 1]), (0, [0])],
+    "t1": [(1, [2]), (2, [1]), (0, [0]), (1, [2]), (2, [0]), (0, [1]), (1, [2]), (2, [1]), (0, [0])],
+}
+
+
+def random_policy(env, infos, rng):
+    """Every free agent picks a macro-action uniformly at random."""
+    return rng.integers(env.n_actions, size=(env.num_envs, env.n_agents))
+
+
+def push_big_box(env, infos, rng):
+    """Box Pushing: walk to the cells below the big box, wait for the other robot, push together."""
+    waypoint = np.array([WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT])
+    if env.primitive:
+        return _walk_and_push(env, env.cell_x[waypoint])
+    placed = env.last_waypoint == waypoint  # [N, agents]
+    return np.where(placed.all(1, keepdims=True), PUSH, np.where(placed, STAY, waypoint))
+
+
+def _walk_and_push(env, x):
+    """Primitive Box Pushing: first along the row, then up to the big box at columns x, [agents], then forward."""
+    forward, left, right, stay = range(4)
+    dx, dy = x - env.position[..., 0], env.box_y[:, 2:] - 1 - env.position[..., 1]  # [N, agents]
+    heading = np.where(dx > 0, 1, np.where(dx < 0, 3, np.where(dy < 0, 2, NORTH)))
+    turn = (heading - env.orientation) & 3
+    placed = (dx == 0) & (dy == 0) & (turn == 0)
+    waits = placed & ~placed.all(1, keepdims=True)
+    return np.where(waits, stay, np.choose(turn, [forward, right, right, left]))
+
+
+def deliver(env, infos, rng, loads):
+    """Warehouse: the arm hands out the tools of `loads`, [(robot, [human, ...]), ...], in this order.
+
+    The arm passes the oldest staged tool as soon as the robot that is to get it waits at the table, else searches the
+    next one while there is room. A robot waits at the table until its load is complete, delivers it in order, waiting
+    at a workshop until the human wants the tool, and comes back.
+    """
+    get_tool, capacity = env.n_humans + 1, env.staging_capacity
+    robot = np.array([robot for robot, humans in loads for _ in humans])  # [tools], of each tool in the arm's order
+    human = np.array([human for _, humans in loads for human in humans])
+    completes = np.concatenate([np.arange(len(humans)) == len(humans) - 1 for _, humans in loads])
+    tool = np.array([(human[:k] == human[k]).sum() for k in range(len(human))])
+
+    found, staged = env.found.sum(1), (env.staged >= 0).sum(1)  # [N]
+    handed = np.arange(len(tool)) < (found - staged)[:, None]  # [N, tools]
+    received = env.phase + env.has_next_tool  # [N, humans]
+    to_deliver = handed & (tool >= received[:, human])
+    actions = np.zeros(env.macro_done.shape, np.int64)
+    for r in range(env.n_robots):
+        latest = len(tool) - 1 - (handed & (robot == r))[:, ::-1].argmax(1)  # any, if none was handed to it
+        mine = to_deliver & (robot == r)
+        actions[:, r] = np.where(mine.any(1) & completes[latest], human[mine.argmax(1)], get_tool)
+
+    move = np.where(env.macro_done, actions, env.macro_action)[:, :-1]
+    waits = (move == get_tool) & (env.position == env.tables).all(-1)  # [N, robots]
+    receiver = robot.take(found - staged, mode="clip")
+    passes = (staged > 0) & np.take_along_axis(waits, receiver[:, None], 1)[:, 0]
+    searches = (found < len(tool)) & (staged < capacity)
+    task = np.where(searches, 1 + env.n_robots + tool.take(found, mode="clip"), 0)
+    task = np.where(passes, 1 + receiver, task)
+    actions[:, -1] = np.where(env.arm_left > 0, env.arm_task, task)  # primitive: do not give up what was begun
+    return actions
+
+
+def move_to_target(env, infos, rng):
+    """Capture Target: Move-to-T, whatever is seen."""
+    return np.zeros(env.macro_done.shape, np.int64)
+
+
+def step_to_target(env, infos, rng):
+    """Primitive Capture Target: step along the axis on which the target is further away, the short way round."""
+    north, south, west, east, stay = range(5)
+    half = env.grid // 2
+    to_go = (env.target[:, None] - env.position + half) % env.grid - half  # [N, agents, (x, y)]
+    dx, dy = to_go[..., 0], to_go[..., 1]
+    along_y = np.where(dy > 0, north, np.where(dy < 0, south, stay))
+    return np.where(np.abs(dx) > np.abs(dy), np.where(dx > 0, east, west), along_y)
+
+
+def script_of(env_id):
+    """(name, policy) of the script for a task."""
+    if env_id.startswith("bp"):
+        return "both push the big box", push_big_box
+    if env_id.startswith("wtd"):
+        return "fixed loads", partial(deliver, loads=LOADS[env_id.split("-")[1]])
+    if env_id.endswith("primitive"):
+        return "always towards the target", step_to_target
+    return "always Move-to-T", move_to_target
+
+
+def play(env_id, policy, episodes, seed, gamma):
+    """Plays episodes side by side: a dict of float64 [episodes]: return, discounted_return, length, success (0 or 1).
+
+    Raises:
+        ValueError: the id is unknown or there are no episodes to play.
+    """
+    env, rng = envs.make(env_id, episodes), np.random.default_rng(seed)
+    _, infos = env.reset(seed=seed)
+    result = {key: np.zeros(episodes) for key in ("return", "discounted_return", "length", "success")}
+    live, step = np.ones(episodes, bool), 0
+    while live.any():
+        _, rewards, terminations, truncations, infos = env.step(policy(env, infos, rng))
+        result["return"] += live * rewards
+        result["discounted_return"] += live * gamma**step * rewards
+        result["length"] += live
+        result["success"] += live & infos["success"]
+        over, step = terminations | truncations, step + 1
+        live &= ~over
+        if over.any():  # play on in ended environments without looking
+            _, infos = env.reset(options={"reset_mask": over})
+    return result
+
+
+def reference(env_id, policy, episodes, seed, gamma):
+    """Means over episodes, with the standard error of the return; rounded, so that files can be compared."""
+    result = play(env_id, policy, episodes, seed, gamma)
+    error = result["return"].std(ddof=1) / episodes**0.5 if episodes > 1 else 0.0
+    numbers = {"return": result["return"].mean(), "se": error}
+    numbers |= {key: result[key].mean() for key in ("discounted_return", "length", "success")}
+    return {key: round(float(value), 6) for key, value in numbers.items()} | {"episodes": episodes}
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--envs", nargs="+", default=envs.IDS, choices=envs.IDS, metavar="ID", help="tasks (all)")
+    parser.add_argument("--episodes", type=int, default=2000, help="of each policy on each task (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of environments and random actions (%(default)s)")
+    parser.add_argument("--gamma", type=float, help=f"discount per step; without it that of the task's family, {GAMMA}")
+    parser.add_argument("-o", "--output", help="JSON file to write, with the tasks that were played")
+    args = parser.parse_args(argv)
+    if args.episodes < 1 or args.seed < 0 or not 0 <= (args.gamma or 0) <= 1:
+        parser.error("--episodes must be at least 1, --seed at least 0 and --gamma between 0 and 1")
+
+    references = {}
+    print(f"{'task':16} {'policy':26} {'return':>9} {'+- SE':>7} {'discounted':>10} {'gamma':>5} {'length':>7} success")
+    for env_id in args.envs:
+        gamma = GAMMA[env_id.split("-")[0]] if args.gamma is None else args.gamma
+        name, script = script_of(env_id)
+        entry = references[env_id] = {
+            "random": reference(env_id, random_policy, args.episodes, args.seed, gamma),
+            "scripted": {"name": name, **reference(env_id, script, args.episodes, args.seed, gamma)},
+        }
+        for policy, x in (("random", entry["random"]), (name, entry["scripted"])):
+            row = f"{env_id:16} {policy:26} {x['return']:9.3f} {x['se']:7.3f} {x['discounted_return']:10.3f} {gamma:5}"
+            print(f"{row} {x['length']:7.2f} {x['success']:7.3f}", flush=True)
+    if args.output:
+        try:
+            Path(args.output).write_text(json.dumps(references, indent=1) + "\n")
+        except OSError as error:
+            parser.error(f"cannot write {args.output}: {error.strerror}")
+
+
+if __name__ == "__main__":
+    main()
