@@ -137,9 +137,10 @@ class Args:
 DEFAULTS = {
     "wtd": {},
     "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
-               td_lambda=0.5, hysteresis_start=0.1),
-    "ct": dict(total_timesteps=1_000_000, gamma=0.98, buffer_size=10_000, exploration_timesteps=400_000, td_lambda=0.8,
-               hysteresis_start=0.2, train_frequency=192, reward_scale=10.0, eval_episodes=100),
+               td_lambda=0.5, hysteresis_start=0.3),
+    "ct": dict(total_timesteps=600_000, num_envs=128, learning_rate=1e-3, learning_rate_end=0.0, gamma=0.9,
+               buffer_size=5_000, exploration_timesteps=150_000, train_frequency=256, td_lambda=0.8, reward_scale=10.0,
+               obs_scale=4.0, hidden_state="stored", hidden_size=32, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip
 
 
