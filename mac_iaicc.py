@@ -90,9 +90,9 @@ class Args:
     # <<< run arguments
 
     # Algorithm
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     """Adam's step size"""
-    learning_rate_end: float | None = None
+    learning_rate_end: float | None = 0.0
     """step size at total_timesteps, reached linearly; None keeps it constant"""
     gamma: float = 0.99
     """discount per environment step, in [0, 1]"""
@@ -106,7 +106,7 @@ class Args:
     """share of uniform macro-actions in the policies at the start"""
     end_e: float = 0.01
     """that share after exploration_timesteps"""
-    exploration_timesteps: int = 1_000_000
+    exploration_timesteps: int = 200_000
     """environment steps over which the share falls linearly"""
     entropy_coef: float = 0.01
     """weight of the policies' entropy in the loss; bigger explores longer"""
@@ -122,10 +122,11 @@ class Args:
 
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "wtd": dict(total_timesteps=4_000_000, eval_frequency=50_000),
-    "bp": dict(total_timesteps=4_000_000, eval_frequency=50_000, gamma=0.95),
-    "ct": dict(total_timesteps=4_000_000, eval_frequency=100_000, gamma=0.98, reward_scale=1.0, eval_episodes=100),
-}
+    "wtd": dict(total_timesteps=400_000, exploration_timesteps=200_000),
+    "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000, gamma=0.95),
+    "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, batch_size=32,
+               reward_scale=1.0, obs_scale=4.0, eval_frequency=40_000, eval_episodes=400),
+}  # fmt: skip
 
 
 # >>> agents, identical to avf_vdn.py

@@ -34,7 +34,7 @@ import envs
 from envs.box_pushing import NORTH, PUSH, STAY, WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT
 
 # The discounts that the algorithm scripts use for a family, so that discounted returns can be put side by side.
-GAMMA = {"bp": 0.95, "wtd": 0.99, "ct": 0.98}
+GAMMA = {"bp": 0.95, "wtd": 0.99, "ct": 0.9}
 
 # For each layout the loads in the order in which the arm hands them out: a robot, and the humans to whom it then goes.
 # A human gets its tools in the order in which it needs them. Three robots can always take one tool at a time, in turn.
