@@ -19,8 +19,8 @@ Numbered deviations from the published baseline:
  1. An episode truncated by the horizon bootstraps from its final observation, a terminated one does not.
  2. A macro-action that is running at the first row of a window or still running at its last gives no transition there.
  3. One gradient norm is clipped over all agents. Their losses are summed, each a mean over the agent's transitions.
- 4. Hyperparameters are ours, see docs/defaults.md. Hysteresis, with the published factors 0.2 to 0.4, is on by default on
-    Box Pushing only: on the other tasks it did worse than none.
+ 4. Hyperparameters are ours, see docs/defaults.md. Hysteresis, with the published factors 0.2 to 0.4, is on by default
+    on Box Pushing only: on the other tasks it did worse than none.
 """
 
 # >>> imports, identical to avf_vdn.py
