@@ -696,14 +696,14 @@ def check(args):
     if args.env not in envs.IDS:
         fail(f"unknown --env {args.env!r}; valid ids: {' '.join(envs.IDS)}")
     zero_to_one = "gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end".split()
-    from_zero = "seed learning_starts learning_rate learning_rate_end max_grad_norm reward_scale obs_scale".split()
+    from_zero = "seed learning_starts learning_rate learning_rate_end max_grad_norm reward_scale obs_scale entropy_coef"
     for field in fields(args):
         value, name = getattr(args, field.name), "--" + field.name.replace("_", "-")
         if field.name in zero_to_one and not 0 <= value <= 1:
             fail(f"{name} must be between 0 and 1, got {value}")
-        if field.name in from_zero and value is not None and not 0 <= value < float("inf"):
+        if field.name in from_zero.split() and value is not None and not 0 <= value < float("inf"):
             fail(f"{name} must not be negative, got {value}")
-        if type(value) is int and field.name not in from_zero and value < 1:
+        if type(value) is int and field.name not in from_zero.split() and value < 1:
             fail(f"{name} must be at least 1, got {value}")
     if args.track and importlib.util.find_spec("wandb") is None:
         fail("--track needs Weights & Biases: pip install -e '.[track]'")
