@@ -405,12 +405,12 @@ def write_figures(sections, output):
         texts = sorted(legend, key=lambda text: legend[text].get_color() == GREY)  # the algorithms first
         for columns in range(min(6, len(texts)), 0, -1):  # as many columns as fit, a column being as wide as its texts
             rows = math.ceil(len(texts) / columns)
-            widths = [max(map(len, texts[i : i + rows])) + 6 for i in range(0, len(texts), rows)]
+            widths = [max(map(len, texts[i : i + rows])) + 9 for i in range(0, len(texts), rows)]
             if sum(widths) < 11 * figure.get_figwidth():
                 break
         figure.set_figheight(figure.get_figheight() + 0.22 * rows)
         handles = [legend[text] for text in texts]
-        figure.legend(handles, texts, loc="outside lower center", ncols=columns, frameon=False)
+        figure.legend(handles, texts, loc="outside lower center", ncols=len(widths), frameon=False)
         figure.savefig(output / file, dpi=150)
         plt.close(figure)
 
