@@ -12,9 +12,9 @@ value, trained on the joint reward (paper: "Value Factorization for Asynchronous
 Numbered deviations from the paper:
  1. Rewards and values are discounted by gamma^tau between decision rows. An episode truncated by the horizon bootstraps
     from its final observation, a terminated one does not.
- 2. Hyperparameters are AVF-QPLEX's, not measured for this script; on Box Pushing and Capture Target they include
-    hysteretic TD errors and Q(lambda), which the paper does not use; --td-lambda 0 --hysteresis-start 1 is the
-    paper's loss.
+ 2. Hyperparameters are AVF-QPLEX's, see docs/defaults.md. They include what the paper does not have: Q(lambda) on Box
+    Pushing and Capture Target, hysteretic TD errors on Box Pushing, scaled inputs and a falling step size on Capture
+    Target. --td-lambda 0 --hysteresis-start 1 is the paper's loss.
 """
 
 # >>> imports, identical to avf_vdn.py

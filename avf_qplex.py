@@ -17,8 +17,8 @@ Numbered deviations from the paper:
  3. The mixer's hypernetworks share one hidden layer of the same total width instead of having one each.
  4. Rewards and values are discounted by gamma^tau between decision rows. An episode truncated by the horizon bootstraps
     from its final observation, a terminated one does not.
- 5. Hyperparameters were chosen by measurement (DEFAULTS; the README says how and where they leave the paper). On Box
-    Pushing and Capture Target they include hysteretic TD errors and Q(lambda), which the paper does not use;
+ 5. Hyperparameters are ours, see docs/defaults.md. They include what the paper does not have: Q(lambda) on Box Pushing
+    and Capture Target, hysteretic TD errors on Box Pushing, scaled inputs and a falling step size on Capture Target.
     --td-lambda 0 --hysteresis-start 1 is the paper's loss.
 """
 
