@@ -173,6 +173,13 @@ def run_job(job):
     return Result("failed", ATTEMPTS, time.time() - started, error)
 
 
+def run_ray_job(job):
+    """`run_job` in a Ray task, which is cancelled by a KeyboardInterrupt."""
+    # Workers of a cluster that was started in the background ignore SIGINT, and Python then raises nothing.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    return run_job(job)
+
+
 def run_script(job, flags, log):
     """Runs a job's script with its flags and these, passes the signals in `stop` on, and returns its exit code."""
     command = [str(ROOT / f"{job.algorithm}.py"), *flags, "--torch-threads=1", *job.flags]
@@ -207,7 +214,7 @@ def start_engine(args):
         fail("--engine ray needs Ray: pip install -e '.[cluster]'")
     except (ConnectionError, ValueError, RuntimeError) as error:
         fail(f"cannot reach Ray: {str(error).splitlines()[0]}")
-    task, references = ray.remote(num_cpus=1, max_retries=LOST_WORKERS)(run_job), []
+    task, references = ray.remote(num_cpus=1, max_retries=LOST_WORKERS)(run_ray_job), []
 
     def start(job):
         references.append(task.remote(job))

@@ -358,7 +358,7 @@ def cluster():
 
 
 def test_stopping_a_sweep_on_ray_loses_nothing(place, cluster):
-    options = ["--pause=0.2", "--total-timesteps=900", "--checkpoint-frequency=900", "--writing=1"]  # three minutes
+    options = ["--pause=2", "--total-timesteps=40", "--checkpoint-frequency=40", "--writing=1"]  # 80 s, if not stopped
     arguments = command(place, *options, seeds="1-3", own=["--engine", "ray", "--address", cluster.address])
     arguments.remove("--workers"), arguments.remove("2")
     process = start(place / "benchmark" / "sweep.py", arguments)
