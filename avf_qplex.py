@@ -311,6 +311,12 @@ class Batch(NamedTuple):
     discount: torch.Tensor  # float32 [R], gamma^tau, 0 where the episode terminated
     valid: torch.Tensor  # bool [B, W], where the R rows stand in their windows
 
+    def by_window(self, x):
+        """Values of the rows, [R, ...], as [W, B, ...], zero where a window has no row."""
+        padded = x.new_zeros(*self.valid.shape, *x.shape[1:])  # [B, W, ...]
+        padded[self.valid] = x
+        return padded.transpose(0, 1)
+
 
 class ReplayBuffer:
     """Whole episodes as arrays: each agent's own decisions, and joint decision rows that point at them.
@@ -484,15 +490,11 @@ def td_loss(utilities, values, target_utilities, target_values, mixer, target_mi
         bootstrap = target_mixer(next_q, next_v, best, batch.next_chosen, batch.next_state)  # [R]
         target = batch.reward + batch.discount * bootstrap
         if td_lambda > 0:  # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
-
-            def windows(x):  # [R] -> [B, W]
-                return torch.zeros(batch.valid.shape, device=x.device).masked_scatter(batch.valid, x)
-
-            returns, next_values, decay = windows(target), windows(bootstrap), td_lambda * windows(batch.discount)
-            decay[:, :-1] *= batch.valid[:, 1:]  # the last row of a window has no further return
-            for k in range(returns.shape[1] - 2, -1, -1):
-                returns[:, k] += decay[:, k] * (returns[:, k + 1] - next_values[:, k])
-            target = returns[batch.valid]
+            returns, next_values, decay = map(batch.by_window, (target, bootstrap, td_lambda * batch.discount))
+            decay[:-1] *= batch.valid.T[1:]  # the last row of a window has no further return
+            for k in range(len(returns) - 2, -1, -1):
+                returns[k] += decay[k] * (returns[k + 1] - next_values[k])
+            target = returns.T[batch.valid]
     error = target - q
     return torch.where(error < 0, hysteresis * error, error).square().mean(), q, target
 
@@ -633,10 +635,8 @@ def train(args):
         progress = min(1.0, step / args.exploration_timesteps)
         epsilon = args.start_e + progress * (args.end_e - args.start_e)
         if args.learning_rate_end is not None:
-            rest = 1 - step / args.total_timesteps
-            optimizer.param_groups[0]["lr"] = args.learning_rate_end + rest * (
-                args.learning_rate - args.learning_rate_end
-            )
+            done = step / args.total_timesteps
+            optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
         actions, moved = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.decide(infos["macro_done"], obs, actions, state, hidden)
@@ -743,14 +743,15 @@ def check(args):
     if args.env not in envs.IDS:
         fail(f"unknown --env {args.env!r}; valid ids: {' '.join(envs.IDS)}")
     zero_to_one = "gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end".split()
-    from_zero = "seed learning_starts learning_rate learning_rate_end max_grad_norm reward_scale obs_scale entropy_coef"
+    from_zero = ["seed", "learning_starts", "learning_rate", "learning_rate_end", "max_grad_norm", "reward_scale"]
+    from_zero += ["obs_scale", "entropy_coef"]
     for field in fields(args):
         value, name = getattr(args, field.name), "--" + field.name.replace("_", "-")
         if field.name in zero_to_one and not 0 <= value <= 1:
             fail(f"{name} must be between 0 and 1, got {value}")
-        if field.name in from_zero.split() and value is not None and not 0 <= value < float("inf"):
+        if field.name in from_zero and value is not None and not 0 <= value < float("inf"):
             fail(f"{name} must not be negative, got {value}")
-        if type(value) is int and field.name not in from_zero.split() and value < 1:
+        if type(value) is int and field.name not in from_zero and value < 1:
             fail(f"{name} must be at least 1, got {value}")
     if args.track and importlib.util.find_spec("wandb") is None:
         fail("--track needs Weights & Biases: pip install -e '.[track]'")

@@ -283,6 +283,12 @@ class Batch(NamedTuple):
     discount: torch.Tensor  # float32 [R], gamma^tau, 0 where the episode terminated
     valid: torch.Tensor  # bool [B, W], where the R rows stand in their windows
 
+    def by_window(self, x):
+        """Values of the rows, [R, ...], as [W, B, ...], zero where a window has no row."""
+        padded = x.new_zeros(*self.valid.shape, *x.shape[1:])  # [B, W, ...]
+        padded[self.valid] = x
+        return padded.transpose(0, 1)
+
 
 class ReplayBuffer:
     """Whole episodes as arrays: each agent's own decisions, and joint decision rows that point at them.
@@ -484,13 +490,8 @@ def own_returns(batch, bootstrap, td_lambda=0.0):
         returns float32 [R, n] and own bool [R, n], where a row starts a macro-action of the agent that ends within the
         window; only there the return is one.
     """
-
-    def windows(x):  # [R, ...] -> [W, B, ...]
-        padded = x.new_zeros(*batch.valid.shape, *x.shape[1:])
-        padded[batch.valid] = x
-        return padded.transpose(0, 1)
-
-    reward, discount, ends, bootstrap = map(windows, (batch.reward, batch.discount, batch.next_chosen, bootstrap))
+    rows = (batch.reward, batch.discount, batch.next_chosen, bootstrap)
+    reward, discount, ends, bootstrap = map(batch.by_window, rows)  # [W, B] twice, [W, B, agents] twice
     returns, ended = torch.zeros_like(bootstrap), torch.zeros_like(ends)
     later, will_end = returns[0], ended[0]  # of the row after
     for k in range(len(reward) - 1, -1, -1):
@@ -676,10 +677,8 @@ def train(args):
         progress = min(1.0, step / args.exploration_timesteps)
         epsilon = args.start_e + progress * (args.end_e - args.start_e)
         if args.learning_rate_end is not None:
-            rest = 1 - step / args.total_timesteps
-            optimizer.param_groups[0]["lr"] = args.learning_rate_end + rest * (
-                args.learning_rate - args.learning_rate_end
-            )
+            done = step / args.total_timesteps
+            optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
         actions, moved = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.decide(infos["macro_done"], obs, actions, state, hidden)
@@ -786,14 +785,15 @@ def check(args):
     if args.env not in envs.IDS:
         fail(f"unknown --env {args.env!r}; valid ids: {' '.join(envs.IDS)}")
     zero_to_one = "gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end".split()
-    from_zero = "seed learning_starts learning_rate learning_rate_end max_grad_norm reward_scale obs_scale entropy_coef"
+    from_zero = ["seed", "learning_starts", "learning_rate", "learning_rate_end", "max_grad_norm", "reward_scale"]
+    from_zero += ["obs_scale", "entropy_coef"]
     for field in fields(args):
         value, name = getattr(args, field.name), "--" + field.name.replace("_", "-")
         if field.name in zero_to_one and not 0 <= value <= 1:
             fail(f"{name} must be between 0 and 1, got {value}")
-        if field.name in from_zero.split() and value is not None and not 0 <= value < float("inf"):
+        if field.name in from_zero and value is not None and not 0 <= value < float("inf"):
             fail(f"{name} must not be negative, got {value}")
-        if type(value) is int and field.name not in from_zero.split() and value < 1:
+        if type(value) is int and field.name not in from_zero and value < 1:
             fail(f"{name} must be at least 1, got {value}")
     if args.track and importlib.util.find_spec("wandb") is None:
         fail("--track needs Weights & Biases: pip install -e '.[track]'")
