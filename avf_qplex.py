@@ -284,7 +284,7 @@ class QPLEXMixer(nn.Module):
         attention = key.abs()[..., None] * torch.sigmoid(agent.unflatten(-1, (self.heads, n)))  # [..., heads, agents]
         if self.of_action:
             action = self.of_action(torch.cat([state, one_hot.flatten(-2)], -1))
-            attention = attention * torch.sigmoid(action.unflatten(-1, (self.heads, n)))
+            attention = attention * torch.sigmoid(action.unflatten(-1, (self.heads, n)))  # [..., heads, agents]
         lambdas = attention.sum(-2)  # [..., agents], not negative: no agent gains by a worse advantage
         return (weight * utilities + bias + (lambdas - 1) * advantages).sum(-1)
 
@@ -432,7 +432,7 @@ class ReplayBuffer:
         next_state = data["state"][episode, row + 1]
         if self.mixer_state == "joint":
             state = data["state"][episode[:, None], own_row].reshape(len(row), -1)  # [R, agents * S]
-            next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)
+            next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)  # the same
         elif self.mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
             state = data["state"][episode, own_row[np.arange(len(row)), next_chosen.argmax(1)]]
         else:

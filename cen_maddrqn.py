@@ -249,7 +249,8 @@ class Team(Agents):
         """The team's observations float32 [N, n * d + n] and joint macro-actions int64 [N] (-1 before the first) of
         agents' macro-observations [N, n, d], who is free, bool [N, n], and macro-actions [N, n]."""
         joint = np.where(actions[:, 0] < 0, -1, actions @ self.strides)
-        return np.concatenate([obs.reshape(len(obs), -1), free], 1, dtype=np.float32), joint
+        team_obs = obs.reshape(len(obs), -1)  # [N, agents * d]
+        return np.concatenate([team_obs, free], 1, dtype=np.float32), joint
 
 
 # <<< team
@@ -406,7 +407,7 @@ class ReplayBuffer:
         next_state = data["state"][episode, row + 1]
         if self.mixer_state == "joint":
             state = data["state"][episode[:, None], own_row].reshape(len(row), -1)  # [R, agents * S]
-            next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)
+            next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)  # the same
         elif self.mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
             state = data["state"][episode, own_row[np.arange(len(row)), next_chosen.argmax(1)]]
         else:

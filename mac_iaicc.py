@@ -366,7 +366,7 @@ class ReplayBuffer:
         next_state = data["state"][episode, row + 1]
         if self.mixer_state == "joint":
             state = data["state"][episode[:, None], own_row].reshape(len(row), -1)  # [R, agents * S]
-            next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)
+            next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)  # the same
         elif self.mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
             state = data["state"][episode, own_row[np.arange(len(row)), next_chosen.argmax(1)]]
         else:
