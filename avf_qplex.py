@@ -24,7 +24,6 @@ Numbered deviations from the paper:
 
 import argparse
 import copy
-import importlib.util
 import json
 import os
 import signal
@@ -38,7 +37,6 @@ import numpy as np
 import torch
 import tyro
 from torch import nn
-from torch.nn import functional as F
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -63,7 +61,7 @@ class Args:
     checkpoint_frequency: float = 60.0  # seconds between checkpoints, from which --resume continues exactly
     runs_dir: str = "runs"  # folder in which each run makes its own
     resume: str | None = None  # run folder of an interrupted run to go on with, with its own settings
-    device: str = "cpu"  # torch device, cpu or cuda
+    device: Literal["cpu", "cuda"] = "cpu"  # where networks learn and act
     track: bool = False  # log to Weights & Biases too, which takes project and entity from its environment variables
 
     # Algorithm
@@ -94,11 +92,11 @@ class Args:
     def __post_init__(self):
         if self.env not in envs.IDS:
             fail(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
-        shares = "learning_rate learning_rate_end gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end"
+        unbounded = "seed learning_starts checkpoint_frequency max_grad_norm".split()
         for name, value in vars(self).items():
-            if type(value) in (int, float):
-                low = 1 if type(value) is int and name not in ("seed", "learning_starts") else 0
-                high = 1 if name in shares.split() else float("inf")
+            if type(value) in (int, float):  # others have their type checked by tyro
+                low = 0 if type(value) is float or name in unbounded else 1
+                high = 1 if type(value) is float and name not in unbounded else float("inf")
                 if not low <= value <= high:
                     fail(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
@@ -158,17 +156,17 @@ class Agents(nn.Module):
         Returns utilities float32 [n, M, A], -inf for macro-actions an agent does not have, and states [n, M, H].
         """
         one_hot = previous[..., None] == self.actions  # [n, M, A]
-        gates = self.gru_input(F.relu(self.encoder(torch.cat([obs, one_hot], 2))))  # [n, M, 3 H]
+        gates = self.gru_input(torch.relu(self.encoder(torch.cat([obs, one_hot], 2))))  # [n, M, 3 H]
         states = []
         for step in gates.split(sizes, 1):
             hidden = hidden[:, : step.shape[1]]
-            in_reset, in_update, in_new = step.chunk(3, 2)  # [n, size, H] each
-            h_reset, h_update, h_new = torch.bmm(hidden, self.gru_hidden).chunk(3, 2)
-            reset, update = torch.sigmoid(in_reset + h_reset), torch.sigmoid(in_update + h_update)
+            in_gates, in_new = step.tensor_split([2 * self.hidden_size], 2)  # [n, size, 2 H], [n, size, H]
+            h_gates, h_new = torch.bmm(hidden, self.gru_hidden).tensor_split([2 * self.hidden_size], 2)
+            reset, update = torch.sigmoid(in_gates + h_gates).chunk(2, 2)
             hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
             states.append(hidden)
         states = torch.cat(states, 1)  # [n, M, H]
-        return self.output(F.relu(self.head(states))).masked_fill(self.padding, -torch.inf), states
+        return self.output(torch.relu(self.head(states))).masked_fill(self.padding, -torch.inf), states
 
 
 def over_rows(batch, *networks):
@@ -229,88 +227,87 @@ class QPLEXMixer(nn.Module):
         advantages = (weight * (utilities - values)).detach()
         one_hot = (actions[..., None] == self.actions).flatten(-2)  # [..., n * A]
         action = self.of_action(torch.cat([state, one_hot], -1))
-        lambdas = key.abs()[..., None] * torch.sigmoid(agent.unflatten(-1, (self.heads, n)))  # [..., heads, n]
-        lambdas = lambdas * torch.sigmoid(action.unflatten(-1, (self.heads, n)))  # [..., heads, n]
-        lambdas = lambdas.sum(-2)  # [..., n], not negative: no agent gains by a worse advantage
+        agent, action = (torch.sigmoid(x.unflatten(-1, (self.heads, n))) for x in (agent, action))  # [..., heads, n]
+        lambdas = (key.abs()[..., None] * agent * action).sum(-2)  # [..., n], not negative: no gain by being worse
         return (weight * utilities + bias + (lambdas - 1) * advantages).sum(-1)
 
 
 class ReplayBuffer:
-    """Whole episodes of rows (Fig. 2): in each, for every agent, what it last saw, what it runs and since which row.
+    """Whole episodes of rows. The macro-state of an agent is the state of the row since which it runs its macro-action.
 
-    The macro-state of an agent is the state of that row. Episodes are collected in `current`, one per environment, and
-    copied to `data` when they end: a window cannot reach into another episode.
-
-    capacity: episodes kept. mixer_state: as in Args.
+    data: rows [capacity + N, horizon + 1], of the episodes that are being written, one in each environment, and of ended
+    ones and free places, which are in a queue, the newest last: a window cannot reach into another episode.
     """
 
     def __init__(self, env, capacity, gamma, mixer_state):
-        self.capacity, self.gamma, self.mixer_state, self.size, self.next = capacity, gamma, mixer_state, 0, 0
-        (n, d), state_size = env.single_observation_space.shape, env.state_size
-        shapes = {"obs": (n, d), "action": (n,), "since": (n,), "reward": (), "discount": (), "state": (state_size,)}
-        if mixer_state == "real":
-            shapes["real"] = (state_size,)
-
-        def arrays(episodes):
-            rows = {key: (episodes, env.horizon + 1, *shape) for key, shape in shapes.items()}
-            kinds = dict.fromkeys(("action", "since", "rows"), np.int64)
-            return {k: np.zeros(shape, kinds.get(k, np.float32)) for k, shape in (rows | {"rows": episodes}).items()}
-
-        self.current, self.data = arrays(env.num_envs), arrays(capacity)
+        n, d = env.single_observation_space.shape
+        row = [  # Fig. 2
+            ("obs", np.float32, (n, d)),  # what every agent last saw
+            ("action", np.int64, n),  # the macro-action that it runs
+            ("since", np.int64, n),  # and since which row: its macro-history moves where that is this one
+            ("state", np.float32, env.state_size),
+            ("real", np.float32, env.state_size),  # the state a step before the next row
+            ("reward", np.float32),  # sum of gamma^t r_t until the next row
+            ("discount", np.float32),  # gamma^tau, 0 where the episode terminated
+        ]
+        self.data = np.zeros((capacity + env.num_envs, env.horizon + 1), np.dtype(row, align=True))
+        self.rows = np.zeros(len(self.data), int)  # of each episode
+        self.queue, self.writing = np.split(np.arange(len(self.data)), [capacity])
+        self.gamma, self.mixer_state, self.size = gamma, mixer_state, 0
 
     def add(self, obs, actions, chosen, state):
         """Notes a row wherever an agent chooses: float32 [N, n, d], int64 [N, n], bool [N, n], float32 [N, S]."""
-        now, env = self.current, np.flatnonzero(chosen.any(1))
-        row = now["rows"][env]
-        since = np.where(chosen[env], row[:, None], now["since"][env, row - 1])
-        new = {"obs": obs[env], "action": actions[env], "since": since, "reward": 0, "discount": 1, "state": state[env]}
+        env = np.flatnonzero(chosen.any(1))
+        episode, row = self.writing[env], self.rows[self.writing[env]]
+        since = np.where(chosen[env], row[:, None], self.data["since"][episode, row - 1])
+        new = dict(obs=obs[env], action=actions[env], since=since, state=state[env], reward=0, discount=1)
         for key, value in new.items():
-            now[key][env, row] = value
-        now["rows"][env] += 1
+            self.data[key][episode, row] = value
+        self.rows[episode] += 1
 
     def reward(self, rewards, state):
         """Adds a step's rewards, float64 [N], to the running rows: r += gamma^t r_t. state: the one before the step."""
-        now, row = self.current, (np.arange(len(rewards)), self.current["rows"] - 1)
-        now["reward"][row] += now["discount"][row] * rewards
-        now["discount"][row] *= self.gamma
-        if self.mixer_state == "real":
-            now["real"][row] = state
+        at = self.writing, self.rows[self.writing] - 1
+        self.data["reward"][at] += self.data["discount"][at] * rewards
+        self.data["discount"][at] *= self.gamma
+        self.data["real"][at] = state
 
-    def finish(self, over, terminated, obs, state):
-        """Ends the episodes in over, bool [N], with their final observation, and moves them to the replay memory."""
-        now, env = self.current, np.flatnonzero(over)
-        now["discount"][env, now["rows"][env] - 1] *= ~terminated[env]  # a truncated episode bootstraps
-        everybody = np.repeat(over[:, None], obs.shape[1], 1)  # [N, n]
-        self.add(obs, np.zeros(everybody.shape, int), everybody, state)
-        slots = (self.next + np.arange(len(env))) % self.capacity
-        for key, array in self.data.items():
-            array[slots] = now[key][env]
-        now["rows"][env] = 0
-        self.size, self.next = min(self.size + len(env), self.capacity), (self.next + len(env)) % self.capacity
+    def finish(self, over, terminated, obs, infos):
+        """Ends the episodes in over, bool [N], with their final observation."""
+        at = self.writing[over], self.rows[self.writing[over]] - 1
+        self.data["discount"][at] *= ~terminated[over]  # a truncated episode bootstraps
+        self.add(obs, infos["macro_action"], infos["macro_done"] & over[:, None], infos["state"])
+        queue, count = np.append(self.queue, self.writing[over]), over.sum()
+        self.writing[over], self.queue = queue[:count], queue[count:]
+        self.rows[self.writing[over]] = 0
+        self.size = min(self.size + count, len(queue) - count)
 
     def sample(self, batch_size, window, rng, device="cpu"):
         """Windows of random episodes, in which every row is as likely as any other: a dict of tensors [B, T, ...].
 
         T = window + 1: `valid` marks the rows that have a next one, at which the target looks. Windows reach over both
-        ends of an episode and are cut there: had all to fit in, the last row, which often has the reward, would be rare.
+        ends of an episode and are cut there: had all to fit in, the last row, often the one with the reward, were rare.
         """
-        data, episode = self.data, rng.integers(self.size, size=(batch_size, 1))
-        last = data["rows"][episode] - 1  # [B, 1], the row of the final observation
+        episode = self.queue[rng.integers(self.size, size=(batch_size, 1)) - self.size]
+        last = self.rows[episode] - 1  # [B, 1], the row of the final observation
         start = rng.integers(1 - window, last)
         end, row = np.minimum(start + window, last), np.maximum(start, 0) + np.arange(window + 1)  # [B, 1], [B, T]
         valid, inside, row = row < end, row <= end, np.minimum(row, end)
-        batch = {key: data[key][episode, row] for key in ("obs", "action", "reward", "discount")}
-        since, episodes = data["since"][episode, row], episode[..., None]  # [B, T, n], [B, 1, 1]
-        before = data["action"][episodes, since - 1, np.arange(since.shape[2])]  # [B, T, n]
-        batch |= {"valid": valid, "chosen": (since == row[..., None]) & inside[..., None]}
-        batch |= {"previous": np.where(since > 0, before, -1), "next_state": data["state"][episode, row]}
+        rows, episodes = self.data[episode, row], episode[..., None]  # [B, T], [B, 1, 1]
+        since, state = rows["since"], rows["state"]  # [B, T, n], [B, T, S]
+        chosen = (since == row[..., None]) & inside[..., None]  # [B, T, n]
+        before = self.data["action"][episodes, since - 1, np.arange(since.shape[2])]  # [B, T, n]
+        batch = {key: rows[key] for key in ("obs", "action", "reward", "discount")}
+        batch |= dict(
+            valid=valid, chosen=chosen, previous=np.where(since > 0, before, -1), state=state, next_state=state
+        )
         if self.mixer_state == "joint":
-            batch["state"] = batch["next_state"] = data["state"][episodes, since].reshape(*row.shape, -1)
+            batch["state"] = batch["next_state"] = self.data["state"][episodes, since].reshape(*row.shape, -1)
         elif self.mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
-            agent = np.roll(batch["chosen"], -1, 1).argmax(2)[..., None]  # [B, T, 1]
-            batch["state"] = data["state"][episode, np.take_along_axis(since, agent, 2)[..., 0]]
-        else:
-            batch["state"] = data["real" if self.mixer_state == "real" else "state"][episode, row]
+            agent = np.roll(chosen, -1, 1).argmax(2)[..., None]  # [B, T, 1]
+            batch["state"] = self.data["state"][episode, np.take_along_axis(since, agent, 2)[..., 0]]
+        elif self.mixer_state == "real":
+            batch["state"] = rows["real"]
         return {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
 
 
@@ -324,7 +321,7 @@ def td_loss(utilities, target_utilities, mixer, target_mixer, batch, td_lambda=0
     Returns the loss (scalar tensor), joint values and targets, float32 [R] each.
     """
     here = batch["valid"]  # [B, T], rows that have a next one
-    there = F.pad(here, (1, -1))  # [B, T], the rows after them
+    there = here.roll(1, 1)  # [B, T], the rows after them: a window's last row has none
     chosen, action = batch["chosen"], batch["action"]  # [B, T, n]
     taken = utilities.gather(3, action[..., None])[..., 0]  # [B, T, n]
     q = mixer(*(x[here] for x in (taken, utilities.amax(3), action, chosen, batch["state"])))  # [R]
@@ -394,8 +391,8 @@ def make_learner(args, env):
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device)
 
 
-def train(args):
-    """Trains from Args, or goes on with the run args.resume; returns the run folder."""
+def train(args, stop=()):
+    """Trains from Args, or goes on with the run args.resume, until something is in stop; returns the run folder."""
     torch.set_num_threads(1)  # fastest for networks of this size
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
@@ -403,45 +400,41 @@ def train(args):
     learner = make_learner(args, env)
     target, agents = copy.deepcopy(learner).requires_grad_(False), learner["agents"]
     optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
-    buffer = ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state)
+    networks, buffer = (learner, target, optimizer), ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state)
+    memory = buffer.data, buffer.rows, buffer.queue, buffer.writing
     obs, infos = env.reset(seed=args.seed)
-    hidden, step, updates, recent, models = agents.start(args.num_envs), 0, 0, [], {}
-    folder = Path(args.resume) if args.resume else make_run_folder(args)
-    if args.resume:
-        saved = load(folder, "checkpoint.pt", args.env)
-        for part, state in zip((learner, target, optimizer), saved["networks"], strict=True):
-            part.load_state_dict(state)
-        buffer.size, buffer.next = saved["buffer"]
-        for part, arrays in zip((buffer.current, buffer.data), saved["episodes"], strict=True):
-            for key, value in arrays.items():
-                part[key][: len(value)] = value
-        obs, infos = env.load_state(saved["env"])
-        rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
-        step, updates, recent, models = saved["progress"]
+    hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
+    folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
     if args.track:
-        import wandb
+        import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    writer = SummaryWriter(folder, purge_step=step + 1)
+    if args.resume:
+        saved, _ = load(folder / "checkpoint.pt")
+        for part, state in zip(networks, saved["networks"], strict=True):
+            part.load_state_dict(state)
+        for array, content in zip(memory, saved["memory"], strict=True):
+            array[:] = content.numpy().view(array.dtype)
+        obs, infos = env.load_state(saved["env"])
+        rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
+        step, updates, recent, best, buffer.size = saved["progress"]
+    else:
+        folder.mkdir(parents=True)
+        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2) + "\n")
+        os.replace(folder / "args.json.new", folder / "args.json")
+    writer, bar = (
+        SummaryWriter(folder, purge_step=step + 1),
+        tqdm(total=args.total_timesteps, initial=step, disable=None),
+    )
+    started, first_step, saved_at = time.time(), step, time.time()
 
-    def checkpoint():
-        def tensors(arrays, count=None):
-            return {k: torch.from_numpy(v[:count]) if isinstance(v, np.ndarray) else v for k, v in arrays.items()}
-
-        writer.flush()  # what was logged up to here is not logged again after a resume
-        save({"run": [ALGORITHM, args.env], "networks": [x.state_dict() for x in (learner, target, optimizer)],
-              "buffer": (buffer.size, buffer.next), "env": tensors(env.save_state()),
-              "episodes": (tensors(buffer.current), tensors(buffer.data, buffer.size)), "hidden": hidden,
-              "rng": rng.bit_generator.state, "progress": (step, updates, recent, models)},
-             folder / "checkpoint.pt")  # fmt: skip
+    def log(group, **values):
+        for key, value in values.items():
+            writer.add_scalar(f"{group}/{key}", value, step)
 
     def due(frequency):
-        return step // frequency > (step - args.num_envs) // frequency or step >= args.total_timesteps
+        return step % frequency < args.num_envs or step >= args.total_timesteps
 
-    stop = []  # Ctrl-C or a termination signal: end between two steps, where a checkpoint is whole
-    handlers = {s: signal.signal(s, lambda number, _: stop.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
-    bar = tqdm(total=args.total_timesteps, initial=step, disable=not sys.stderr.isatty())
-    started, first_step, saved_at = time.time(), step, time.time()
     while step < args.total_timesteps and not stop:
         # Choose and step
         progress, done = min(1.0, step / args.exploration_timesteps), step / args.total_timesteps
@@ -454,11 +447,12 @@ def train(args):
         obs, rewards, terminations, truncations, infos = env.step(actions)
         buffer.reward(rewards, state)
         hidden, step = moved, step + args.num_envs
+        bar.update(args.num_envs)
 
         # Store the episodes that ended and start new ones
         over = terminations | truncations
         if over.any():
-            buffer.finish(over, terminations, obs, infos["state"])
+            buffer.finish(over, terminations, obs, infos)
             recent += zip(env.episode_return[over].tolist(), env.elapsed[over].tolist(), strict=True)
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
@@ -466,10 +460,9 @@ def train(args):
         # Learn
         while updates < (step - args.learning_starts) // args.train_frequency and buffer.size:
             batch = buffer.sample(args.batch_size, args.window, rng, args.device)
-            utilities, target_utilities = over_rows(batch, agents, target["agents"])
+            utilities = over_rows(batch, agents, target["agents"])
             beta = args.hysteresis_start + progress * (args.hysteresis_end - args.hysteresis_start)
-            mixers = learner["mixer"], target["mixer"]
-            loss, joint_q, _ = td_loss(utilities, target_utilities, *mixers, batch, args.td_lambda, beta)
+            loss, joint_q, _ = td_loss(*utilities, learner["mixer"], target["mixer"], batch, args.td_lambda, beta)
             optimizer.zero_grad()
             loss.backward()
             grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
@@ -478,83 +471,54 @@ def train(args):
                 slow.data.lerp_(fast.data, 1 - args.polyak)
             updates += 1
             if updates % 100 == 0:
-                for key, value in (("td_loss", loss), ("q_values", joint_q.mean()), ("grad_norm", grad_norm)):
-                    writer.add_scalar(f"losses/{key}", value.item(), step)
+                log("losses", td_loss=loss, q_values=joint_q.mean(), grad_norm=grad_norm)
 
         # Log, evaluate, save
         if due(2_000) and recent:
             sps, (mean_return, mean_length) = (step - first_step) / (time.time() - started), np.mean(recent, 0)
-            for key, value in (("SPS", sps), ("epsilon", epsilon), ("episodic_return", mean_return),
-                               ("episodic_length", mean_length)):  # fmt: skip
-                writer.add_scalar(f"charts/{key}", value, step)
-            bar.set_postfix_str(f"return {mean_return:.1f}, epsilon {epsilon:.2f}", refresh=False)
-            bar.update(step - bar.n)
+            log("charts", SPS=sps, epsilon=epsilon, episodic_return=mean_return, episodic_length=mean_length)
             recent = []
         if due(args.eval_frequency):
             eval_seed = int(np.random.SeedSequence([args.seed, step]).generate_state(1)[0])
             result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, eval_seed).items()}
-            for key, value in result.items():
-                writer.add_scalar(f"eval/{key}", value, step)
-            model = {"step": step, "return": result["return"], "networks": copy.deepcopy(learner.state_dict())}
-            models = {"last": model, "best": max(models.get("best", model), model, key=lambda m: m["return"])}
-            save({"run": [ALGORITHM, args.env], **models}, folder / "model.pt")
+            log("eval", **result)
+            model = {"step": step, "return": result["return"], "networks": learner.state_dict()}
+            save(folder / "last.pt", args, **model)
+            if result["return"] >= best:
+                best = result["return"]
+                save(folder / "best.pt", args, **model)
             bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
         if time.time() - saved_at > args.checkpoint_frequency or stop:
-            checkpoint()
+            writer.flush()  # what was logged up to here is not logged again after a resume
+            arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
+            save(folder / "checkpoint.pt", args, networks=[part.state_dict() for part in networks],
+                 memory=[torch.from_numpy(array.view(np.uint8)) for array in memory], env=arrays,
+                 rng=rng.bit_generator.state, hidden=hidden,
+                 progress=(step, updates, recent, best, buffer.size))  # fmt: skip
             saved_at = time.time()
 
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
     bar.close()
     writer.close()
-    if step < args.total_timesteps:
-        print(f"stopped at step {step}; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
-        sys.exit(128 + stop[0])
-    (folder / "checkpoint.pt").unlink(missing_ok=True)
+    if step >= args.total_timesteps:
+        (folder / "checkpoint.pt").unlink(missing_ok=True)
     return folder
 
 
-def save(saved, path):
+def save(path, args, **content):
     """Writes beside the file and swaps, so that a kill at any moment leaves the old one or the new one."""
-    torch.save(saved, f"{path}.new")
+    torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, f"{path}.new")
     os.replace(f"{path}.new", path)
 
 
-def load(folder, name, env_id):
-    """What `save` wrote in a run folder, on the CPU; it must be of this algorithm and task."""
+def load(path):
+    """What `save` wrote, on the CPU, and its Args."""
     try:
-        saved = torch.load(Path(folder) / name, map_location="cpu", weights_only=True)  # runs no code of the file
-    except FileNotFoundError:
-        fail(f"there is no {name} in {folder}")
+        saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
+        if saved["algorithm"] != ALGORITHM:
+            fail(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
+        return saved, Args(**saved["args"])
     except Exception as error:  # torch names no common class for what a damaged file raises
-        fail(f"{Path(folder) / name} is damaged: {str(error).splitlines()[0]}")
-    if saved["run"] != [ALGORITHM, env_id]:
-        fail(f"{Path(folder) / name} is of {' on '.join(saved['run'])}, not of {ALGORITHM} on {env_id}")
-    return saved
-
-
-def make_run_folder(args):
-    """Makes runs_dir/<env>__<script>__<seed>__<microseconds> with args.json in it."""
-    folder = Path(args.runs_dir) / f"{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}"
-    try:
-        folder.mkdir(parents=True)
-        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2) + "\n")
-        os.replace(folder / "args.json.new", folder / "args.json")
-    except OSError as error:
-        fail(f"cannot write to --runs-dir {args.runs_dir}: {error.strerror}")
-    return folder
-
-
-def load_args(folder):
-    """The Args of a run folder."""
-    try:
-        saved = json.loads((Path(folder) / "args.json").read_text())
-        algorithm = saved.pop("algorithm")
-        if algorithm != ALGORITHM:
-            fail(f"{folder} is a run of {algorithm}, not of {ALGORITHM}")
-        return Args(**saved)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        fail(f"{folder} is not a run folder: args.json: {error}")
+        fail(f"cannot read {path}: {str(error).splitlines()[0]}")
 
 
 def parse_args(argv=None):
@@ -564,18 +528,23 @@ def parse_args(argv=None):
     peek.add_argument("--resume")
     known = peek.parse_known_args(argv)[0]
     family = DEFAULTS.get(known.env.split("-")[0], {})
-    base = load_args(known.resume) if known.resume else Args(env=known.env, **family)
+    base = load(Path(known.resume) / "checkpoint.pt")[1] if known.resume else Args(env=known.env, **family)
     args = tyro.cli(Args, default=base, args=argv)
-    if args.resume and replace(args, resume=None, device=base.device) != base:
+    if known.resume and args != replace(base, resume=args.resume, device=args.device):
         fail("--resume goes on with the run's own settings: only --device can be given with it")
-    if args.track and importlib.util.find_spec("wandb") is None:
-        fail("--track needs Weights & Biases: pip install -e '.[track]'")
-    try:
-        torch.zeros(1, device=args.device)
-    except (RuntimeError, AssertionError) as error:
-        fail(f"--device {args.device} is not available: {str(error).splitlines()[0]}")
+    if args.device == "cuda" and not torch.cuda.is_available():
+        fail("--device cuda: there is none")
     return args
 
 
 if __name__ == "__main__":
-    print(train(parse_args()))
+    stop = []  # Ctrl-C or a termination signal: end between two steps, where a checkpoint is whole
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
+    try:
+        print(folder := train(parse_args(), stop))
+    except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
+        fail(error)
+    if (folder / "checkpoint.pt").exists():
+        print(f"stopped; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
+        sys.exit(128 + stop[0])

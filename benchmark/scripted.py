@@ -121,32 +121,26 @@ def step_to_target(env, infos, rng):
 
 
 def script_of(env_id):
-    """(name, policy) of the script for a task."""
+    """(name, policy, whether it is optimal) of the script for a task."""
     if env_id.startswith("bp"):
-        return "both push the big box", push_big_box
+        return "both push the big box", push_big_box, True
     if env_id.startswith("wtd"):
-        return "fixed loads", partial(deliver, loads=LOADS[env_id.split("-")[1]])
+        return "fixed loads", partial(deliver, loads=LOADS[env_id.split("-")[1]]), True
     if env_id.endswith("primitive"):
-        return "always towards the target", step_to_target
-    return "always Move-to-T", move_to_target
+        return "always towards the target", step_to_target, False
+    return "always Move-to-T", move_to_target, False
 
 
 def play(env_id, policy, episodes, seed, gamma):
-    """Plays episodes side by side: a dict of float64 [episodes]: return, discounted_return, length, success (0 or 1).
-
-    Raises:
-        ValueError: the id is unknown or there are no episodes to play.
-    """
+    """Plays episodes side by side: a dict of float64 [episodes]: return, discounted_return, length, success (0 or 1)."""
     env, rng = envs.make(env_id, episodes), np.random.default_rng(seed)
     _, infos = env.reset(seed=seed)
     result = {key: np.zeros(episodes) for key in ("return", "discounted_return", "length", "success")}
     live, step = np.ones(episodes, bool), 0
     while live.any():
         _, rewards, terminations, truncations, infos = env.step(policy(env, infos, rng))
-        result["return"] += live * rewards
-        result["discounted_return"] += live * gamma**step * rewards
-        result["length"] += live
-        result["success"] += live & infos["success"]
+        for key, value in zip(result, (rewards, gamma**step * rewards, 1, infos["success"]), strict=True):
+            result[key] += live * value
         over, step = terminations | truncations, step + 1
         live &= ~over
         if over.any():  # play on in ended environments without looking
@@ -154,41 +148,35 @@ def play(env_id, policy, episodes, seed, gamma):
     return result
 
 
-def reference(env_id, policy, episodes, seed, gamma):
+def reference(env_id, policy, episodes, seed=0):
     """Means over episodes, with the standard error of the return; rounded, so that files can be compared."""
-    result = play(env_id, policy, episodes, seed, gamma)
-    error = result["return"].std(ddof=1) / episodes**0.5 if episodes > 1 else 0.0
-    numbers = {"return": result["return"].mean(), "se": error}
-    numbers |= {key: result[key].mean() for key in ("discounted_return", "length", "success")}
-    return {key: round(float(value), 6) for key, value in numbers.items()} | {"episodes": episodes}
+    result = play(env_id, policy, episodes, seed, GAMMA[env_id.split("-")[0]])
+    means = {key: x.mean() for key, x in result.items()} | {"se": result["return"].std(ddof=1) / episodes**0.5}
+    return {key: round(float(x), 6) for key, x in means.items()} | {"episodes": episodes}
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=envs.IDS, choices=envs.IDS, metavar="ID", help="tasks (all)")
     parser.add_argument("--episodes", type=int, default=2000, help="of each policy on each task (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of environments and random actions (%(default)s)")
-    parser.add_argument("--gamma", type=float, help=f"discount per step; without it that of the task's family, {GAMMA}")
-    parser.add_argument("-o", "--output", help="JSON file to write, with the tasks that were played")
+    parser.add_argument("-o", "--output", type=Path, help="JSON file to write, with the tasks that were played")
     args = parser.parse_args(argv)
-    if args.episodes < 1 or args.seed < 0 or not 0 <= (args.gamma or 0) <= 1:
-        parser.error("--episodes must be at least 1, --seed at least 0 and --gamma between 0 and 1")
-
+    if args.episodes < 2:
+        parser.error("--episodes must be at least 2")
     references = {}
-    print(f"{'task':16} {'policy':26} {'return':>9} {'+- SE':>7} {'discounted':>10} {'gamma':>5} {'length':>7} success")
+    print(f"{'task':16} {'policy':26} {'return':>9} {'+- SE':>7} {'discounted':>10} {'length':>7} success")
     for env_id in args.envs:
-        gamma = GAMMA[env_id.split("-")[0]] if args.gamma is None else args.gamma
-        name, script = script_of(env_id)
-        entry = references[env_id] = {
-            "random": reference(env_id, random_policy, args.episodes, args.seed, gamma),
-            "scripted": {"name": name, **reference(env_id, script, args.episodes, args.seed, gamma)},
-        }
-        for policy, x in (("random", entry["random"]), (name, entry["scripted"])):
-            row = f"{env_id:16} {policy:26} {x['return']:9.3f} {x['se']:7.3f} {x['discounted_return']:10.3f} {gamma:5}"
+        name, script, optimal = script_of(env_id)
+        scripted = {"name": name, "optimal": optimal, **reference(env_id, script, args.episodes)}
+        references[env_id] = {"random": reference(env_id, random_policy, args.episodes), "scripted": scripted}
+        for kind, x in references[env_id].items():
+            row = (
+                f"{env_id:16} {x.get('name', kind):26} {x['return']:9.3f} {x['se']:7.3f} {x['discounted_return']:10.3f}"
+            )
             print(f"{row} {x['length']:7.2f} {x['success']:7.3f}", flush=True)
     if args.output:
         try:
-            Path(args.output).write_text(json.dumps(references, indent=1) + "\n")
+            args.output.write_text(json.dumps(references, indent=1) + "\n")
         except OSError as error:
             parser.error(f"cannot write {args.output}: {error.strerror}")
 

@@ -1,48 +1,48 @@
-"""How fast environments and scripts are on this machine, and whether they have become slower.
+"""How fast environments and scripts are on this machine, and whether a change made them slower.
 
-    python benchmark/speed.py                               a table: some minutes, everything
-    python benchmark/speed.py -o before.json                and a baseline file
-    python benchmark/speed.py --compare before.json         the table with ratios; exit code 1 beyond --tolerance
+    python benchmark/speed.py -o before.json               a table, and a file of it
+    python benchmark/speed.py --compare before.json        the table with ratios; exit code 1 beyond --tolerance
+    python benchmark/speed.py --against ../other-checkout  update and train of the scripts here and there, in turn
 
-What is measured, several times in turn with a fixed reference workload, of which the fastest counts:
+    env      a step of one environment with random macro-actions, drawn before; resets included
+    act      what a script takes to choose for one environment, at the default number of environments
+    update   a gradient update: a training run less the same without updates, by their number. Mac-IAICC learns from
+             whole episodes: its update is what it spends on learning for each environment step
+    train    an environment step of a training run that updates as often as by default, less the start of the program
 
-    env         environment steps per second with random macro-actions, which are drawn before; resets included
-    act         environment steps per second that `act` can choose for, at the default number of environments
-    update      gradient updates per second: a training run less the same run without updates, by the number of updates;
-                rows/s are the decision rows replayed in them (Mac-IAICC replays none)
-    train       environment steps per second of a training run that updates as often as by default, from the start on;
-                what a run of one step costs (folder, networks, last evaluation, checkpoint) is taken off
-
-Times are CPU seconds of this process, which uses one thread: programs beside it that want the processor do not count.
-A baseline file holds every time as a multiple of that of the reference workload beside it, and ratios are those of such
-multiples, because a processor that is slower for the moment, or another one, changes both. Kinds of machines differ in
-more than that, so compare with a baseline of the same kind; how much of a ratio is noise, two runs of the same code
-tell.
+Times are CPU seconds of one thread, so programs beside it that want the processor do not count; the fastest of several
+rounds counts. A file has them as multiples of a fixed reference workload that was measured in turn with them, because a
+processor that is slower for the moment changes both. Training is measured through the command line, so the other
+checkout may be of any age.
 """
 
 import argparse
-import contextlib
 import importlib
-import io
 import json
+import os
+import resource
+import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script, Python looks in this folder only
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, Python looks in this folder only
 
 import envs
+from benchmark import record
 
-SCRIPTS = tuple(sorted(path.stem for path in Path(__file__).parents[1].glob("*.py")))
 TRAINED = ("wtd-s", "bp-10", "ct-10")
 BATCHES = (1, 32, 256)
 CALLS = 200
-SHORT = 5  # times as often as training runs: noise weighs more on what takes a fraction of a second
+
+
+def fail(message):
+    """Ends the program with one line."""
+    raise SystemExit(f"speed: {message}")
 
 
 def reference_workload():
@@ -58,15 +58,16 @@ def reference_workload():
         torch.lerp(torch.tanh(gates[0]), hidden, torch.sigmoid(gates[1])).sum().backward()
 
 
-def fastest(repeats, *functions):
-    """Lowest CPU seconds of the reference workload and of each function, called in turn: float64 [1 + functions]."""
+def cpu_seconds(function, *arguments):
+    """CPU seconds of this process and of those that it started and waited for, in a call."""
 
-    def seconds(function):
-        start = time.process_time()
-        function()
-        return time.process_time() - start
+    def now():
+        children = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return time.process_time() + children.ru_utime + children.ru_stime
 
-    return np.min([[seconds(f) for f in (reference_workload, *functions)] for _ in range(repeats)], axis=0)
+    start = now()
+    function(*arguments)
+    return now() - start
 
 
 def play(env, actions):
@@ -74,144 +75,132 @@ def play(env, actions):
     obs, infos = env.reset(seed=0)
     for action in actions:
         obs, _, terminations, truncations, infos = env.step(action)
-        over = terminations | truncations
-        if over.any():
+        if (over := terminations | truncations).any():
             obs, infos = env.reset(options={"reset_mask": over})
     return obs, infos
 
 
-def measure_env(env_id, num_envs, repeats):
-    """{name: entry of an environment step}."""
-    env, rng = envs.make(env_id, num_envs), np.random.default_rng(0)
-    actions = rng.integers(env.n_actions, size=(CALLS, num_envs, env.n_agents))
-    reference, seconds = fastest(SHORT * repeats, lambda: play(env, actions))
-    return {f"env {env_id} x {num_envs}": entry(seconds / (CALLS * num_envs), reference)}
+def stepping(env_id, num_envs, steps=CALLS):
+    """A function that takes steps, and its environments."""
+    env = envs.make(env_id, num_envs)
+    actions = np.random.default_rng(0).integers(env.n_actions, size=(steps, num_envs, env.n_agents))
+    return lambda: play(env, actions), env
 
 
-def measure_act(script, env_id, repeats):
-    """As measure_env, of one environment's macro-actions; half of them random."""
-    args = script.defaults(env_id)
-    env, rng = envs.make(env_id, args.num_envs), np.random.default_rng(0)
-    agents = script.make_learner(args, env)[0]["agents"]
-    # After a few steps agents decide at different times.
-    obs, infos = play(env, rng.integers(env.n_actions, size=(10, args.num_envs, env.n_agents)))
-
-    def choose():
-        hidden = agents.start(args.num_envs)
-        for _ in range(CALLS):
-            _, hidden = script.act(agents, obs, infos, hidden, 0.5, rng)
-
-    reference, seconds = fastest(SHORT * repeats, choose)
-    name = f"act {script.ALGORITHM} {env_id} x {args.num_envs}"
-    return {name: entry(seconds / (CALLS * args.num_envs), reference)}
+def acting(script, env_id):
+    """A function that chooses CALLS times, and the environments for which it does."""
+    args = script.parse_args([f"--env={env_id}"])
+    some_steps, env = stepping(env_id, args.num_envs, 10)
+    obs, infos = some_steps()  # agents decide at different times now
+    agents, rng = script.make_learner(args, env)["agents"], np.random.default_rng(0)
+    hidden = agents.start(args.num_envs)
+    return lambda: [script.act(agents, obs, infos, hidden, 0.5, rng) for _ in range(CALLS)], env
 
 
-def measure_training(script, env_id, steps, repeats):
-    """As measure_env, of an update (with the mean number of rows in it) and of a step of training."""
-    common = dict(total_timesteps=steps, eval_frequency=10**9, eval_episodes=1, checkpoint_frequency=10**9)
-    replays = "window" in {field.name for field in fields(script.Args)}
-    # An actor-critic learns from every batch of episodes: it does not where the batch is never full.
-    learning, idle = ({"learning_starts": 0}, {"learning_starts": steps}) if replays else ({}, {"batch_size": steps})
-    saved = {}
-
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
-
-        def run(**options):
-            args = script.defaults(env_id, runs_dir=folder, **{**common, **options})
-            saved.update(torch.load(script.train(args) / "checkpoint.pt", weights_only=True))
-            if saved["step"] < args.total_timesteps:
-                raise KeyboardInterrupt  # which train takes as a wish to stop
-
-        run(total_timesteps=1)  # the first of a process imports things
-        reference, begin, without, total = fastest(
-            repeats, lambda: run(total_timesteps=1), lambda: run(**idle), lambda: run(**learning)
-        )
-    measures = {f"train {script.ALGORITHM} {env_id}": entry((total - begin) / saved["step"], reference)}
-    if saved["updates"] and total > without:  # else the run was too short to tell
-        rows = None
-        if replays:
-            args = script.defaults(env_id)
-            buffer, rng = script.make_learner(args, envs.make(env_id, args.num_envs))[1], np.random.default_rng(0)
-            buffer.load(saved["buffer"])
-            rows = np.mean([buffer.sample(args.batch_size, args.window, rng).valid.sum() for _ in range(20)]).item()
-        update = entry((total - without) / saved["updates"], reference, rows)
-        measures[f"update {script.ALGORITHM} {env_id}"] = update
-    return measures
+def train(checkout, name, flags):
+    """Runs a script of a checkout, in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, f"{name}.py", f"--runs-dir={folder}", *(f"--{k}={v}" for k, v in flags.items())]
+        threads = os.environ | {"OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, cwd=checkout, env=threads, capture_output=True, text=True, check=False)
+    if done.returncode:
+        fail(f"{checkout}/{name}.py: {(done.stderr.strip().splitlines() or ['no output'])[-1]}")
 
 
-def entry(seconds, reference, rows=None):
-    """What is kept of a measure: seconds each, the same in reference workloads, rows replayed each (None: none)."""
-    return {"seconds": seconds, "relative": seconds / reference, "rows": rows}
+def training(checkouts, name, env_id, steps, rounds):
+    """Seconds of an update and of a step of training, {measure: float64 [rounds, checkouts]}, and the reference's."""
+    args = importlib.import_module(name).parse_args([f"--env={env_id}"])
+    common = {"env": env_id, "total-timesteps": steps, "eval-frequency": 10**9, "eval-episodes": 1,
+              "checkpoint-frequency": 10**9}  # fmt: skip
+    if hasattr(args, "train_frequency"):
+        updates, common["train-frequency"] = steps // args.train_frequency, args.train_frequency
+        idle, learning = {"learning-starts": steps}, {"learning-starts": 0}
+    else:  # an actor-critic learns from every batch of episodes: it does not where the batch is never full
+        updates, idle, learning = steps, {"batch-size": steps}, {}
+    seconds, reference = np.zeros((3, rounds, len(checkouts))), np.zeros(rounds)
+    for i in range(rounds):
+        reference[i] = cpu_seconds(reference_workload)
+        for k, flags in enumerate((common | {"total-timesteps": 1}, common | idle, common | learning)):
+            for j, checkout in enumerate(checkouts):
+                seconds[k, i, j] = cpu_seconds(train, checkout, name, flags)
+    begin, without, total = seconds
+    return {"update": (total - without) / updates, "train": (total - begin) / steps}, reference
 
 
-def measure(scripts, env_ids, steps, repeats):
-    """Yields {name: entry} for all that is asked for; env_ids None: every environment, and the scripts on TRAINED."""
+def measure(names, env_ids, steps, rounds):
+    """Yields (name of a measure, seconds each, the same in reference workloads) of all that is asked for."""
+
+    def short(name, function, env):
+        pairs = [(cpu_seconds(reference_workload), cpu_seconds(function)) for _ in range(5 * rounds)]
+        reference, seconds = np.min(pairs, axis=0)
+        seconds /= CALLS * env.num_envs
+        return f"{name} x {env.num_envs}", seconds, seconds / reference
+
     for env_id in env_ids or envs.IDS:
         for num_envs in BATCHES:
-            yield measure_env(env_id, num_envs, repeats)
-    for name in scripts:
-        script = importlib.import_module(name)
+            yield short(f"env {env_id}", *stepping(env_id, num_envs))
+    for name in names:
         for env_id in env_ids or TRAINED:
-            yield measure_act(script, env_id, repeats)
-            yield measure_training(script, env_id, steps, repeats)
+            yield short(f"act {name} {env_id}", *acting(importlib.import_module(name), env_id))
+            found, reference = training([record.ROOT], name, env_id, steps, rounds)
+            for kind, seconds in found.items():
+                yield f"{kind} {name} {env_id}", seconds.min(), seconds.min() / reference.min()
 
 
-def verdict(ratio):
-    """Time now by time before, in words."""
-    return f"x{ratio:.2f} slower" if ratio >= 1 else f"x{1 / ratio:.2f} faster"
+def compare_checkouts(other, names, env_ids, steps, rounds):
+    """Prints update and train here and in the other checkout."""
+    print(f"{'measure':30} {'ms here':>9} {'there':>9} {'ratio':>7}  median of the rounds' ratios (lowest to highest)")
+    for name in names:
+        for env_id in env_ids or TRAINED:
+            for kind, x in training([record.ROOT, other], name, env_id, steps, rounds)[0].items():
+                (here, there), ratios = 1000 * x.min(axis=0), x[:, 0] / x[:, 1]
+                row = f"{kind + ' ' + name + ' ' + env_id:30} {here:9.4f} {there:9.4f} {here / there:7.3f}"
+                print(f"{row}  {np.median(ratios):.3f} ({ratios.min():.3f} to {ratios.max():.3f})", flush=True)
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scripts", nargs="*", default=SCRIPTS, choices=SCRIPTS, metavar="NAME", help="scripts (all)")
-    parser.add_argument("--envs", nargs="+", choices=envs.IDS, metavar="ID",
-                        help=f"tasks (environments: all; scripts: {' '.join(TRAINED)})")  # fmt: skip
-    parser.add_argument("--steps", type=int, default=10_000, help="environment steps of a training run (%(default)s)")
-    parser.add_argument(
-        "--repeats",
-        type=int,
-        default=3,
-        help=f"of a training run (%(default)s); {SHORT} times as many of what is short",
-    )
-    parser.add_argument("-o", "--output", help="baseline file to write")
-    parser.add_argument("--compare", metavar="FILE", help="baseline file to compare with")
-    parser.add_argument("--tolerance", type=float, default=1.3, help="ratio beyond which it fails (%(default)s)")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.error = fail
+    add = parser.add_argument
+    add("--scripts", nargs="*", default=record.scripts(), choices=record.scripts(), metavar="NAME", help="default: all")
+    add("--envs", nargs="+", choices=envs.IDS, metavar="ID", help=f"default: all; of scripts {' '.join(TRAINED)}")
+    add("--steps", type=int, default=10_000, help="environment steps of a training run (%(default)s)")
+    add("--rounds", type=int, default=3, help="of training runs (%(default)s); 5 times as many of what is short")
+    add("-o", "--output", type=Path, help="file to write")
+    add("--compare", metavar="FILE", type=Path, help="such a file to compare with")
+    add("--tolerance", type=float, default=1.3, help="ratio beyond which that fails (%(default)s)")
+    add("--against", metavar="FOLDER", type=Path, help="another checkout to compare with")
     args = parser.parse_args(argv)
-    if min(args.steps, args.repeats) < 1 or not args.tolerance > 0:
-        parser.error("--steps and --repeats must be at least 1 and --tolerance above 0")
-    before = None
+    if min(args.steps, args.rounds) < 1 or not args.tolerance > 0:
+        fail("--steps and --rounds must be at least 1 and --tolerance above 0")
+    selected = args.scripts, args.envs, args.steps, args.rounds
+    if args.against:
+        if not args.against.is_dir():
+            fail(f"--against {args.against} is no folder")
+        return compare_checkouts(args.against.resolve(), *selected)
+    before = {}
     if args.compare:
         try:
-            baseline = json.loads(Path(args.compare).read_text())
-            before = {name: float(x["relative"]) for name, x in baseline["measures"].items()}
-            steps = baseline["steps"]
+            before = json.loads(args.compare.read_text())
+            if before.pop("steps") != args.steps:
+                fail(f"{args.compare} was measured with other --steps")
+            before = {name: float(relative) for name, (_, relative) in before.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            parser.error(f"{args.compare} is not a baseline file: {type(error).__name__}: {error}")
-        if steps != args.steps:
-            parser.error(f"{args.compare} was measured with --steps {steps}")
-
+            fail(f"{args.compare} is not such a file: {error!r}")
     torch.set_num_threads(1)
-    measures, slower = {}, []
-    print(f"{'measure':34} {'per second':>11} {'ms each':>10} {'rows/s':>9}" + "  against the baseline" * bool(before))
-    for found in measure(args.scripts, args.envs, args.steps, args.repeats):
-        measures |= found
-        for name, x in found.items():
-            rows = f"{x['rows'] / x['seconds']:,.0f}" if x["rows"] else ""
-            row = f"{name:34} {1 / x['seconds']:11,.0f} {1000 * x['seconds']:10.4f} {rows:>9}"
-            if before is not None:
-                ratio = x["relative"] / before[name] if name in before else None
-                row += f"  {verdict(ratio) if ratio else 'not in the baseline'}"
-                slower += [name] if ratio and ratio > args.tolerance else []
-            print(row, flush=True)
+    measures, slower = {"steps": args.steps}, []
+    print(f"{'measure':34} {'per second':>11} {'ms each':>10}{'  time : before' * bool(before)}")
+    for name, seconds, relative in measure(*selected):
+        measures[name], ratio = (seconds, relative), relative / before.get(name, np.nan)
+        print(f"{name:34} {1 / seconds:11,.0f} {1000 * seconds:10.4f}" + f"  {ratio:13.2f}" * bool(before), flush=True)
+        slower += [name] if ratio > args.tolerance else []
     if args.output:
         try:
-            Path(args.output).write_text(json.dumps({"steps": args.steps, "measures": measures}, indent=1) + "\n")
+            args.output.write_text(json.dumps(measures, indent=1) + "\n")
         except OSError as error:
-            parser.error(f"cannot write {args.output}: {error.strerror}")
-    if before is not None and not measures.keys() & before.keys():
-        parser.error(f"{args.compare} has none of these measures")
+            fail(f"cannot write {args.output}: {error.strerror}")
     if slower:
-        raise SystemExit(f"more than x{args.tolerance} slower: {', '.join(slower)}")
+        raise SystemExit(f"more than {args.tolerance} times as long: {', '.join(slower)}")
 
 
 if __name__ == "__main__":

@@ -1,18 +1,20 @@
 """Runs algorithms x tasks x seeds: each run is one of the scripts in a process of its own.
 
     python benchmark/sweep.py --algos avf_vdn avf_qmix --envs wtd-s bp-10 --seeds 1-5 --workers 2
-    python benchmark/sweep.py --algos avf_qmix --envs wtd-s --seeds 1-3 -- --mixer-state single
+    python benchmark/sweep.py --algos avf_qmix --envs wtd-s --seeds 1-3 --record -- --mixer-state single
 
-What follows -- goes to every script. Runs with a checkpoint of their last step are skipped, others go on from their
-checkpoint, a crashed one is tried once more. Ctrl-C, SIGTERM and, on Linux, even the death of this program make the
-scripts write a checkpoint and end; the same command goes on where it stopped.
+What follows -- goes to every script. Finished runs are skipped, others go on from their checkpoint, a crashed one is
+tried once more. Ctrl-C, SIGTERM and, on Linux, even the death of this program make the scripts write a checkpoint and
+end; the same command goes on where it stopped. A run is the same if algorithm, task, flags, seed and code are the same
+(record.py); runs that were started by hand are left alone.
+
+With --record finished runs are added to runs.csv and evaluations.csv, in benchmark/results or a folder of your own, and
+what is in there is skipped, even where its run folder is gone: so a large grid is made in several sittings.
 
 With --engine ray each run is a Ray task of one CPU, on this machine or on the cluster at --address, whose nodes must
 have this repository and the runs folder under the same paths. A run whose worker is lost goes on elsewhere.
 
-A run is known by the args.json in its folder: the same algorithm and arguments, but for those that do not change the
-result. While a process works on it, its log is locked (flock), so several sweeps may share a runs folder. The log is
-<runs-dir>/logs/<env>__<script>__<seed>__<checksum of the arguments>.log.
+While a process works on a run, its log in <runs-dir>/logs is locked (flock), so several sweeps may share a runs folder.
 """
 
 import argparse
@@ -29,26 +31,28 @@ import sys
 import time
 import zlib
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
+from datetime import timedelta
 from pathlib import Path
 
-import torch
+import pandas as pd
 from tqdm import tqdm
 
-ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, Python looks in this folder only
+
+import envs
+from benchmark import record
+
 ATTEMPTS = 2  # of a run that crashes
 LOST_WORKERS = 10  # times that a run is moved to another Ray worker
 LOCK_SECONDS = 120  # to wait for another process to leave a run; NFS needs 90 to give up the locks of a lost machine
-FREE = {"runs_dir", "device", "torch_threads", "resume", "checkpoint_frequency"}  # these do not tell runs apart
-FREE |= {"track", "wandb_project_name", "wandb_entity"}
-OWN = {"--env", "--seed", "--runs-dir", "--resume", "--evaluate"}  # flags that the sweep sets
 
 # The signals to pass on to the scripts: those this program received, or in a Ray worker the cancellations of its task.
 stop = []
 
 # A script is started by this program, which passes signals on. On Linux it dies with the process that started it, and
 # the script gets SIGTERM when it dies. Not directly: a dying process sends one for each of its threads, and to a script
-# the second one means to end at once.
+# the second one may mean to end at once.
 GUARD = """import ctypes, os, signal, subprocess, sys
 prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else lambda option, number: None
 prctl(1, signal.SIGKILL)
@@ -60,35 +64,9 @@ if os.getppid() == int(sys.argv[1]):
     sys.exit(code if code >= 0 else 128 - code)"""
 
 
-@dataclass(frozen=True)
-class Job:
-    """A run to be made. arguments: those that tell runs apart, see `key`. flags: those behind --. steps: of the run."""
-
-    algorithm: str
-    env: str
-    seed: int
-    runs_dir: str
-    arguments: str
-    flags: tuple
-    steps: int
-
-    def __str__(self):
-        return f"{self.algorithm} {self.env} seed {self.seed}"
-
-    @property
-    def log(self):
-        checksum = zlib.crc32(self.arguments.encode())
-        return Path(self.runs_dir) / "logs" / f"{self.env}__{self.algorithm}__{self.seed}__{checksum:08x}.log"
-
-
-@dataclass
-class Result:
-    """How a job ended: skipped, finished, failed, stopped, or busy where another process works on it."""
-
-    status: str
-    attempts: int = 0
-    seconds: float = 0.0
-    error: str = ""
+# A job is a dict: the KEY of a run (see record.py), as text, with variant, options (the words behind --) and runs_dir,
+# and how it ended: recorded, skipped, finished, failed, stopped, or busy where another process works on it.
+NOT_RUN = {"result": "recorded", "folder": None, "attempts": 0, "seconds": 0.0, "error": ""}
 
 
 def fail(message):
@@ -96,57 +74,45 @@ def fail(message):
     raise SystemExit(f"sweep: {message}")
 
 
-def key(arguments):
-    """The arguments that tell runs apart, as one string."""
-    return json.dumps({name: value for name, value in arguments.items() if name not in FREE}, sort_keys=True)
+def key(run):
+    """Which run a job or a row of runs.csv is of."""
+    return tuple(run[name] for name in record.KEY)
 
 
-def read(path):
-    """What a script saved, or None if there is no whole file. The tensors stay on the disk, so any size is quick."""
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception:  # torch names no common class for what a damaged file raises
-        return None
+def name(job):
+    return f"{job['algorithm']} {job['env']} seed {job['seed']}"
 
 
-def read_all(job, name):
-    """[(folder, what is saved in its file of that name), ...] of the run folders with a job's arguments."""
-    found = []
-    for path in Path(job.runs_dir).glob(f"{job.env}__{job.algorithm}__{job.seed}__*/args.json"):
-        try:
-            if key(json.loads(path.read_text())) == job.arguments:
-                found.append((path.parent, read(path.parent / name)))
-        except ValueError:  # killed while the file was written
-            pass
-    return [(folder, saved) for folder, saved in found if saved]
+def log_path(job):
+    checksum = zlib.crc32(repr(key(job)).encode())
+    return Path(job["runs_dir"]) / "logs" / "{env}__{algorithm}__{seed}__{:08x}.log".format(checksum, **job)
+
+
+def run_folders(job):
+    """Run folders of a job's algorithm, task and seed, the newest last."""
+    found = Path(job["runs_dir"]).glob("{env}__{algorithm}__{seed}__*/args.json".format(**job))
+    return sorted(path.parent for path in found)
 
 
 def find_run(job):
-    """The folder and the step of a job's furthest checkpoint, (None, 0) if there is none."""
-    saved = [(folder, saved["step"]) for folder, saved in read_all(job, "checkpoint.pt")]
-    return max(saved, key=lambda run: run[1], default=(None, 0))
-
-
-def evaluated(job):
-    """The step and the greedy return of a job's last evaluation, (0, nan) before the first."""
-    models = [(saved["last"]["step"], saved["last"]["return"]) for _, saved in read_all(job, "model.pt")]
-    return max(models, default=(0, float("nan")))
+    """The folder of a job's run and whether the run is finished; (None, False) if there is nothing to go on with."""
+    unfinished = None
+    for folder in run_folders(job):
+        if (folder / record.ORIGIN).exists() and key(record.describe(folder)) == key(job):
+            if record.is_finished(folder):
+                return folder, True
+            unfinished = folder if (folder / "checkpoint.pt").exists() else unfinished
+    return unfinished, False
 
 
 def run_job(job):
-    """Runs a job to its end, from its checkpoint if there is one; the same on this machine and in a Ray task.
+    """Runs a job to its end, from its checkpoint if there is one, and returns it as it ended; also in a Ray task."""
+    started, attempts, code, error, folder = time.time(), 0, None, "", None
 
-    Args:
-        job: Job.
+    def ended(result):
+        return job | dict(result=result, folder=folder, attempts=attempts, seconds=time.time() - started, error=error)
 
-    Returns:
-        Result, of a run that failed as well.
-
-    Raises:
-        OSError: the log cannot be written or locked.
-    """
-    started, code, error = time.time(), None, ""
-    with open(job.log, "a") as log:
+    with open(log_path(job), "a") as log:
         # The script inherits the lock with its output: the run is free when the script has ended, too.
         while not stop:
             try:
@@ -154,23 +120,26 @@ def run_job(job):
                 break
             except BlockingIOError:
                 if time.time() - started > LOCK_SECONDS:
-                    return Result("busy")
+                    return ended("busy")
                 time.sleep(0.2)
-        for attempt in range(ATTEMPTS + 1):
-            folder, step = find_run(job)
-            if step >= job.steps:
-                return Result("finished", attempt, time.time() - started)
-            if stop or code == 0:
-                return Result("stopped", attempt, time.time() - started)
-            if attempt:
-                output = job.log.read_text(errors="replace").rpartition("\n=== ")[2].strip().splitlines()[1:]
+        while True:
+            folder, finished = find_run(job)
+            if finished:
+                return ended("finished" if attempts else "skipped")
+            if stop or code in (128 + signal.SIGINT, 128 + signal.SIGTERM):
+                return ended("stopped")
+            if attempts:
+                output = log_path(job).read_text(errors="replace").rpartition("\n=== ")[2].strip().splitlines()[1:]
                 how = f"killed by {signal.Signals(code - 128).name}" if code > 128 else f"exit code {code}"
                 error = f"{how}: {output[-1] if output else 'no output'}"
-                tqdm.write(f"{job}: crash {attempt} of at most {ATTEMPTS}, {error}", sys.stderr)
-            if attempt < ATTEMPTS:
-                new = [f"--env={job.env}", f"--seed={job.seed}", f"--runs-dir={job.runs_dir}"]
-                code = run_script(job, [f"--resume={folder}"] if folder else new, log)
-    return Result("failed", ATTEMPTS, time.time() - started, error)
+                print(f"{name(job)}: crash {attempts} of at most {ATTEMPTS}, {error}", file=sys.stderr)
+            if record.checksum(job["algorithm"]) != job["checksum"]:
+                error = "the code was changed since the sweep began"
+                return ended("failed")
+            if attempts == ATTEMPTS:
+                return ended("failed")
+            attempts += 1
+            code = run_script(job, folder, log)
 
 
 def run_ray_job(job):
@@ -180,21 +149,29 @@ def run_ray_job(job):
     return run_job(job)
 
 
-def run_script(job, flags, log):
-    """Runs a job's script with its flags and these, passes the signals in `stop` on, and returns its exit code."""
-    command = [str(ROOT / f"{job.algorithm}.py"), *flags, "--torch-threads=1", *job.flags]
+def run_script(job, folder, log):
+    """Runs a job's script, or goes on with a run folder, passes the signals in `stop` on, returns its exit code."""
+    flags = ["--env={env}", "--seed={seed}", "--runs-dir={runs_dir}"]
+    new = [flag.format(**job) for flag in flags] + job["options"]
+    command = [str(record.ROOT / f"{job['algorithm']}.py"), *([f"--resume={folder}"] if folder else new)]
     print(time.strftime("=== %F %T"), socket.gethostname(), shlex.join(command), file=log, flush=True)
-    # In a process group of its own: Ctrl-C would reach it from the terminal, too, and a second signal ends it at once.
+    origin = {name: job[name] for name in ("flags", "variant", "checksum")}
+    origin |= {"commit": record.commit(), "processor": record.processor()}
+    before, passed, ended = set(run_folders(job)), 0, False
+    # In a process group of its own: Ctrl-C would reach it from the terminal, too, and the scripts want it once.
     streams = dict(stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-    threads = {**os.environ, "OMP_NUM_THREADS": "1"}
     guarded = [sys.executable, "-c", GUARD, str(os.getpid()), *command]
-    process = subprocess.Popen(guarded, env=threads, process_group=0, **streams)
-    passed = 0
-    while process.poll() is None:
+    process = subprocess.Popen(guarded, env={**os.environ, "OMP_NUM_THREADS": "1"}, process_group=0, **streams)
+    while not ended:
         try:
+            ended = process.poll() is not None
             for number in stop[passed:]:
                 process.send_signal(number)
                 passed += 1
+            for made in set(run_folders(job)) - before:  # by this script, or by one with other flags beside it
+                if record.describe(made)["flags"] == job["flags"]:
+                    record.replace_text(made / record.ORIGIN, json.dumps(origin, indent=2) + "\n")
+                before.add(made)
             time.sleep(0.1)
         except KeyboardInterrupt:  # how Ray cancels a task, in processes that block SIGINT
             stop.append(signal.SIGTERM)
@@ -209,6 +186,7 @@ def start_engine(args):
     try:
         import ray
 
+        ray.cloudpickle.register_pickle_by_value(record)  # workers do not find this repository's modules
         ray.init(args.address, num_cpus=args.workers)
     except ImportError:
         fail("--engine ray needs Ray: pip install -e '.[cluster]'")
@@ -224,113 +202,103 @@ def start_engine(args):
 
 
 def run_jobs(jobs, args):
-    """Runs jobs side by side and shows how far they are; returns {job: Result}."""
+    """Runs jobs side by side, shows how far they are and records finished runs; returns what `run_job` returns."""
     start, interrupt = start_engine(args)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number in handlers:
         signal.signal(number, lambda number, frame: stop.append(number))
-    results, pending, interrupted, looked = {}, {start(job): job for job in jobs}, 0, time.time()
-    quiet = not sys.stderr.isatty()
-    steps = {job: 0 if quiet else evaluated(job)[0] for job in jobs}
-    look = dict(disable=quiet, bar_format="{percentage:3.0f}%|{bar:20}| {desc} [{elapsed}<{remaining}]")
-    with tqdm(desc="starting", total=sum(job.steps for job in jobs), initial=sum(steps.values()), **look) as bar:
+    results, pending, interrupted = [], {start(job): job for job in jobs}, 0
+    with tqdm(total=len(jobs), unit="run", smoothing=0, disable=not sys.stderr.isatty()) as bar:
         while pending:
             for future in wait(pending, timeout=1, return_when=FIRST_COMPLETED).done:
                 job = pending.pop(future)
                 try:
-                    result = future.result()
+                    job = future.result()
+                    if args.record and job["result"] in ("finished", "skipped"):
+                        run, evaluations = record.read_folder(job["folder"])
+                        record.add(args.record, run | {"variant": job["variant"]}, evaluations)
                 except Exception as error:  # the engine's own: an unwritable log, or workers lost once too often
-                    reason = str(error).strip().rpartition("\n")[2]
-                    result = Result("stopped" if stop else "failed", error=f"{type(error).__name__}: {reason}")
-                results[job], steps[job] = result, job.steps
-                line = f"[{len(results)}/{len(jobs)}] {job}: {result.status}, {clock(result.seconds)}"
-                line += f", greedy return {evaluated(job)[1]:.2f}" if result.status == "finished" else ""
+                    job |= {"result": "stopped" if stop else "failed", "error": repr(error).strip().splitlines()[-1]}
+                results.append(job)
+                seconds, value = timedelta(seconds=round(job["seconds"])), record.last_evaluation(job["folder"])[1]
+                line = (
+                    f"[{len(results)}/{len(jobs)}] {name(job)}: {job['result']}, {seconds}, greedy return {value:.2f}"
+                )
                 tqdm.write(line, sys.stderr)
+                bar.update()
             if len(stop) > interrupted:
                 interrupted = len(stop)
                 interrupt()
                 tqdm.write("sweep: stopping, the scripts write their checkpoints", sys.stderr)
-            if not quiet and time.time() - looked > 10:
-                looked, steps = time.time(), steps | {job: evaluated(job)[0] for job in pending.values()}
-            bar.set_description_str(f"{len(results)} of {len(jobs)} runs", refresh=False)
-            bar.update(sum(steps.values()) - bar.n)
+            bar.refresh()
     for number, handler in handlers.items():
         signal.signal(number, handler)
     return results
 
 
-def clock(seconds):
-    """Seconds as h:mm:ss."""
-    return f"{seconds // 3600:.0f}:{seconds // 60 % 60:02.0f}:{seconds % 60 // 1:02.0f}"
-
-
 def table(results):
-    """{job: Result} as a table in aligned columns, and below it a line for each failure."""
-    rows = [("algorithm", "env", "seed", "result", "return", "time", "attempts", "folder")]
-    for job, result in results.items():
-        value = f"{evaluated(job)[1]:.2f}" if result.status in ("finished", "skipped") else "-"
-        spent = (clock(result.seconds), result.attempts) if result.attempts else ("-", "-")
-        rows.append((job.algorithm, job.env, job.seed, result.status, value, *spent, find_run(job)[0] or "-"))
-    widths = [max(len(str(cell)) for cell in column) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(f"{cell!s:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    failed = [(job, result.error) for job, result in results.items() if result.status == "failed"]
-    return "\n".join(lines + [f"{job} failed: {error} (log: {job.log})" for job, error in failed])
+    """Results as a table, and below it a line for each failure."""
+    frame = pd.DataFrame(results)
+    frame["return"] = [record.last_evaluation(folder)[1] for folder in frame["folder"]]
+    frame["time"] = [str(timedelta(seconds=round(seconds))) for seconds in frame["seconds"]]
+    columns = ["algorithm", "env", "seed", "result", "return", "time", "attempts", "folder"]
+    lines = [frame[columns].to_string(index=False, float_format="%.2f", na_rep="-")]
+    for job in results:
+        if job["result"] == "failed":
+            lines.append(f"{name(job)} failed: {job['error']} (log: {log_path(job)})")
+    return "\n".join(lines)
 
 
-def parse_seeds(texts):
-    """Seeds from texts such as 1-5, 0,2,7 or 3, each once."""
+def parse_seeds(text):
+    """The seeds in a word such as 1-5 or 0,2,7 or 3."""
     seeds = []
-    for part in ",".join(texts).split(","):
-        match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
-        if not match or int(match[1]) > int(match[2] or match[1]):
-            fail(f"--seeds takes 1-5 or 0,2,7 or 1 2 3, not {' '.join(texts)!r}")
-        seeds += range(int(match[1]), int(match[2] or match[1]) + 1)
-    return list(dict.fromkeys(seeds))
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        if not re.fullmatch(r"\d+(-\d+)?", part) or int(first) > int(last or first):
+            raise argparse.ArgumentTypeError(f"takes 1-5 or 0,2,7 or 1 2 3, not {text!r}")
+        seeds += range(int(first), int(last or first) + 1)
+    return seeds
 
 
-def make_jobs(args, flags):
-    """The jobs of a sweep. Bad names and flags end the program, values of flags in the words of the script."""
-    sys.path.insert(0, str(ROOT))
-    import envs
-
-    scripts, arguments = sorted(path.stem for path in ROOT.glob("*.py")), {}
-    for what, names, valid in (("algorithm", args.algos, scripts), ("environment", args.envs, envs.IDS)):
-        for name in names:
-            if name not in valid:
-                fail(f"unknown {what} {name!r}; valid names: {' '.join(valid)}")
-    for flag in flags:
-        if flag.split("=")[0].replace("_", "-") in OWN:
-            fail(f"{flag} is set by the sweep and cannot stand behind --")
-    for algorithm in dict.fromkeys(args.algos):
-        script = importlib.import_module(algorithm)
-        for env in dict.fromkeys(args.envs):
-            try:
-                parsed = script.parse_args([f"--env={env}", *flags])
-            except SystemExit as stopped:
-                if stopped.code == 2:  # the parser has told what it does not know, but not whose it is
-                    fail(f"{algorithm} does not take {shlex.join(flags)}")
-                raise
-            # The nodes of a cluster may have devices that this machine has not.
-            script.check(replace(parsed, device="cpu") if args.engine == "ray" else parsed)
-            arguments[algorithm, env] = {"algorithm": algorithm, **asdict(parsed)}
-    return [  # all of the first seed before the second, so that a sweep of days soon shows something of everything
-        Job(algorithm, env, seed, args.runs_dir, key(a | {"seed": seed}), tuple(flags), a["total_timesteps"])
-        for seed in parse_seeds(args.seeds)
-        for (algorithm, env), a in arguments.items()
-    ]
+def make_jobs(args, options):
+    """The jobs of a sweep. Bad flags behind -- end the program, bad values of them in the words of the script."""
+    cells = []
+    for algorithm, env in dict.fromkeys((algorithm, env) for algorithm in args.algos for env in args.envs):
+        usual = record.defaults(algorithm, env) | {"runs_dir": args.runs_dir}
+        own = [f"--{name.replace('_', '-')}={usual[name]}" for name in ("env", "seed", "runs_dir")]
+        try:
+            arguments = asdict(importlib.import_module(algorithm).parse_args([*own, *options]))
+        except SystemExit as stopped:
+            if stopped.code == 2:  # the parser has told what it does not know, but not whose it is
+                fail(f"{algorithm} does not take {shlex.join(options)}")
+            raise
+        if any(arguments[name] != usual[name] for name in ("env", "seed", "runs_dir")):
+            fail("--env, --seed and --runs-dir cannot stand behind --, the sweep sets them")
+        cells.append((algorithm, env, record.flags_of(algorithm, arguments), record.checksum(algorithm)))
+    jobs = []  # all of the first seed before the second, so that a sweep of days soon shows something of everything
+    for seed in dict.fromkeys(sum(args.seeds, [])):
+        for algorithm, env, flags, checksum in cells:
+            jobs.append({"algorithm": algorithm, "env": env, "flags": flags, "seed": str(seed), "checksum": checksum,
+                         "variant": flags if args.variant is None else args.variant, "options": options,
+                         "runs_dir": args.runs_dir} | NOT_RUN)  # fmt: skip
+    return jobs
 
 
 def parse_args(argv):
     """The sweep's own arguments, and the list of the scripts' flags behind --."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--algos", nargs="+", required=True, help="names of scripts, without .py")
-    parser.add_argument("--envs", nargs="+", required=True, help="ids of tasks")
-    parser.add_argument("--seeds", nargs="+", required=True, help="1-5 or 0,2,7 or 1 2 3")
-    parser.add_argument("--workers", type=int, help="runs side by side (default: CPU cores of this machine)")
-    parser.add_argument("--runs-dir", default="runs", help="folder of the run folders (default: runs)")
-    parser.add_argument("--engine", choices=("local", "ray"), default="local", help="default: local")
-    parser.add_argument("--address", help="with --engine ray: of a cluster, or auto (default: starts one here)")
-    parser.add_argument("--dry-run", action="store_true", help="only list what would be run, resumed and skipped")
+    parser.error = fail
+    add, names = parser.add_argument, dict(nargs="+", required=True, metavar="NAME")
+    add("--algos", choices=record.scripts(), help="names of scripts, without .py", **names)
+    add("--envs", choices=envs.IDS, help="ids of tasks", **names)
+    add("--seeds", type=parse_seeds, nargs="+", required=True, help="1-5 or 0,2,7 or 1 2 3")
+    add("--workers", type=int, help="runs side by side (default: CPU cores of this machine)")
+    add("--runs-dir", default="runs", help="folder of the run folders (default: runs)")
+    add("--record", type=Path, nargs="?", const=record.RESULTS, metavar="FOLDER", help="keep results in a folder")
+    add("--variant", help="what reports call runs with these flags (default: the flags)")
+    add("--engine", choices=("local", "ray"), default="local", help="default: local")
+    add("--address", help="with --engine ray: of a cluster, or auto (default: starts one here)")
+    add("--dry-run", action="store_true", help="only list what would be run, resumed and skipped")
     cut = argv.index("--") if "--" in argv else len(argv)
     args = parser.parse_args(argv[:cut])
     if args.workers is not None and args.workers < 1:
@@ -345,30 +313,30 @@ def parse_args(argv):
 def main(argv=None):
     """Runs a sweep; returns 0 if every run is finished, 128 + the signal if it was stopped, 1 otherwise."""
     argv = sys.argv[1:] if argv is None else argv
-    args, flags = parse_args(argv)
-    plan = {job: find_run(job) for job in make_jobs(args, flags)}
-    if args.dry_run:
-        for job, (folder, step) in plan.items():
-            how = f"skip {folder}" if step >= job.steps else f"resume at step {step} {folder}" if folder else "run"
-            print(f"{job}: {how}")
-        return 0
-    logs = Path(args.runs_dir) / "logs"
+    args, options = parse_args(argv)
+    jobs, recorded = make_jobs(args, options), set()
     try:
-        logs.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        fail(f"cannot write to --runs-dir {args.runs_dir}: {error.strerror}")
-    if not os.access(logs, os.W_OK):
-        fail(f"cannot write to {logs}: Permission denied")
+        if args.record:
+            recorded = {key(run) for run in record.load(args.record)[0].to_dict("records")}
+        if not args.dry_run:
+            (Path(args.runs_dir) / "logs").mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        fail(f"cannot use --record or --runs-dir: {error}")
+    todo = [job for job in jobs if key(job) not in recorded]
+    if args.dry_run:
+        for job in jobs:
+            folder, finished = find_run(job)
+            how = "recorded" if job not in todo else "skip" if finished else "resume" if folder else "run"
+            print(f"{name(job)}: {how} {folder or ''}".rstrip())
+        return 0
     stop.clear()
-    results = {job: Result("skipped") for job, (_, step) in plan.items() if step >= job.steps}
-    todo = [job for job in plan if job not in results]
-    results |= run_jobs(todo, args) if todo else {}
-    print(table({job: results[job] for job in plan}))
+    ended = {key(job): job for job in jobs + run_jobs(todo, args)}  # those that were not run, too
+    print(table([ended[key(job)] for job in jobs]))
     if stop:
         command = shlex.join([sys.argv[0], *argv])
         print(f"sweep: stopped, nothing is lost; go on with: python {command}", file=sys.stderr)
         return 128 + stop[0]
-    return 0 if all(result.status in ("finished", "skipped") for result in results.values()) else 1
+    return 0 if all(job["result"] in ("recorded", "skipped", "finished") for job in ended.values()) else 1
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from avf_qmix import QMIXMixer
 from avf_qplex import QPLEXMixer
 from avf_vdn import VDNMixer
 from theory.igm import mac_igm_batch, situations
+from theory.variants import SeeOngoing
 
 
 def joint_tables(mixer, utilities, terminated, state, values=None):
@@ -49,9 +50,9 @@ def joint_tables(mixer, utilities, terminated, state, values=None):
 MIXERS = {  # (sizes, width of the state) -> mixer
     "VDN": lambda sizes, width: VDNMixer(),
     "QMIX": lambda sizes, width: QMIXMixer(len(sizes), width),
-    "literal": partial(QPLEXMixer, mask_ongoing=False, see_ongoing=False),
-    "blind": partial(QPLEXMixer, see_ongoing=False),
-    "conditioned": QPLEXMixer,
+    "literal": partial(QPLEXMixer, mask_ongoing=False),
+    "as shipped": QPLEXMixer,  # conditioned on ongoing agents
+    "told m^-": SeeOngoing,  # conditioned, and its weights see what they are doing
 }
 
 
@@ -143,7 +144,7 @@ def random_family(kind, sizes, rng):
             return np.array([q[m] for _, _, m in index])
 
 
-CLASSES = ("VDN", "QMIX", "monotone", "literal", "blind", "conditioned")
+CLASSES = ("VDN", "QMIX", "monotone", "literal", "as shipped", "told m^-")
 
 
 def cone(name, sizes, ranks):
@@ -153,7 +154,7 @@ def cone(name, sizes, ranks):
     "QMIX": rises, and has rising differences (one layer of ELU is convex); a bound, for 2 agents. The others are QPLEX
     with w_i > 0, b_i and lambda_i >= 0 free: b + sum_i w_i V_i gives a 1; each disadvantage of a macro-action that is
     not greedy a -1, in V_i if the agent is ongoing and conditioned, else in lambda_i A_i. "literal": not conditioned,
-    its weights see neither who is ongoing nor m^-. "blind": conditioned, same weights. "conditioned": they see both.
+    its weights see neither who is ongoing nor m^-. "as shipped": conditioned, same weights. "told m^-": they see both.
 
     Args:
         ranks: for each agent the order of its utilities, a permutation of 0 .. |M^i| - 1; the highest is greedy.
@@ -177,7 +178,7 @@ def cone(name, sizes, ranks):
             return {("value",): 1} | {("gain", upper): 1 for upper in _upper_sets(sizes) if rank in upper}
         if name == "literal":
             return {("value",): 1} | ({("loss", m): -1} if worse else {})
-        if name == "blind":
+        if name == "as shipped":
             return {("value",): 1} | {("loss", i, m if terminated[i] else m[i]): -1 for i in worse}
         return {("value", situation): 1} | ({("loss", situation, m): -1} if worse_choice else {})
 
@@ -262,57 +263,58 @@ def fit(mixer, sizes, families, steps=2_000, learning_rate=0.005, seed=0):
 
 
 def represent(utilities, tables):
-    """A conditioned QPLEXMixer that has the given table in every situation (README: the proof), for a state of width 1.
+    """A SeeOngoing mixer that has the given table in every situation (README: the proof), for a state of width 1.
 
-    A hidden unit for each situation, and one for each joint action. The first agent that deviates is charged the whole
-    loss. Agent i's lambda uses one head for each terminated set that contains i: 2^(n - 1) heads.
+    A hidden unit for each situation, and one for each joint action in each. The first agent that deviates is charged
+    the whole loss. One head is enough, as every weight sees the situation.
 
     Args:
         utilities: n arrays [|M^i|]. tables: {(terminated, ongoing): array [|M^1|, ..., |M^n|]}, satisfying Mac-IGM
             (ties="every"); entries that do not agree with m^- are ignored.
 
     Returns:
-        QPLEXMixer, float64.
+        SeeOngoing, float64.
     """
     sizes = [len(u) for u in utilities]
-    n, widest, heads, joint = len(sizes), max(sizes), 2 ** (len(sizes) - 1), list(np.ndindex(*sizes))
-    sets = [[t for t in itertools.product((True, False), repeat=n) if t[i]] for i in range(n)]
-    lambdas = np.zeros((heads, n, len(joint)))
-    mixer = QPLEXMixer(sizes, 1, -(-max(len(tables), len(joint)) // heads), heads).double().requires_grad_(False)
+    n, widest, index = len(sizes), max(sizes), [row for row in rows(sizes) if row[:2] in tables]
+    mixer = SeeOngoing(sizes, 1, max(len(tables), len(index)), heads=1).double().requires_grad_(False)
     for parameter in mixer.parameters():
         parameter.zero_()
     (state_in, _, state_out), (action_in, _, action_out) = mixer.of_state, mixer.of_action
 
-    outputs = np.zeros((len(tables), 2 * n + heads + heads * n))
-    for unit, ((terminated, ongoing), table) in enumerate(tables.items()):
-        top = tuple(int(u.argmax()) if t else on for u, t, on in zip(utilities, terminated, ongoing, strict=True))
-        values = [u[m] for u, m in zip(utilities, top, strict=True)]
-        outputs[unit, :n], outputs[unit, n : 2 * n] = 1.0, (table[top] - sum(values)) / n
-        gates = np.full((heads, n), -40.0)  # sigmoid(-40) = 4e-18
-        for i in np.flatnonzero(terminated):
-            gates[sets[i].index(terminated), i] = 40.0
-        outputs[unit, 2 * n + heads :] = gates.ravel()
-        for k, m in enumerate(joint):
-            deviators = [i for i in range(n) if terminated[i] and utilities[i][m[i]] < values[i]]
-            if deviators and all(t or m[i] == ongoing[i] for i, t in enumerate(terminated)):
-                i = deviators[0]
-                lambdas[sets[i].index(terminated), i, k] = (table[top] - table[m]) / (values[i] - utilities[i][m[i]])
-        at = state_in.weight[unit, 1:].view(n, widest)  # fires where the given m^- is this situation's
+    def fire(layer, unit, terminated, ongoing, m=None):
+        """A hidden unit that is 1 where m^-, and m if given, are these, and 0 elsewhere."""
+        weights = layer.weight[unit, 1:].view(-1, n, widest)  # of m^-, and of m
         for i in range(n):
             if terminated[i]:
-                at[i] = -1.0
+                weights[0, i] = -1.0
             else:
-                at[i, ongoing[i]] = 1.0
-        state_in.bias[unit] = 1.0 - (n - sum(terminated))
-    scale = 2.0 * lambdas.max() or 1.0
-    outputs[:, 2 * n : 2 * n + heads] = scale
-    state_out.weight[:, : len(tables)] = torch.from_numpy(outputs.T)
+                weights[0, i, ongoing[i]] = 1.0
+        layer.bias[unit] = 1.0 - (n - sum(terminated))
+        if m is not None:
+            weights[1, range(n), m] = 1.0
+            layer.bias[unit] -= n
 
-    for k, m in enumerate(joint):
-        action_in.weight[k, 1:].view(n, widest)[range(n), m] = 1.0
-        action_in.bias[k] = 1.0 - n
-    share = np.maximum(lambdas / scale, 1e-20)
-    action_out.weight[:, : len(joint)] = torch.from_numpy(np.log(share / (1 - share)).reshape(heads * n, -1))
+    def greedy(terminated, ongoing):
+        return tuple(int(u.argmax()) if t else on for u, t, on in zip(utilities, terminated, ongoing, strict=True))
+
+    lambdas = np.zeros((n, len(index)))
+    for k, (*situation, m) in enumerate(index):
+        fire(action_in, k, *situation, m)
+        table, top = tables[tuple(situation)], greedy(*situation)
+        losses = [u[best] - u[own] for u, best, own in zip(utilities, top, m, strict=True)]
+        if any(losses):
+            i = int(np.flatnonzero(losses)[0])
+            lambdas[i, k] = (table[top] - table[m]) / losses[i]
+    scale = 2.0 * lambdas.max(initial=0.0) or 1.0
+    share = np.maximum(lambdas / scale, 1e-20)  # at most 1/2
+    action_out.weight[:, : len(index)] = torch.from_numpy(np.log(share / (1 - share)))
+
+    for unit, (situation, table) in enumerate(tables.items()):
+        fire(state_in, unit, *situation)
+        top = greedy(*situation)
+        state_out.weight[n : 2 * n, unit] = (table[top] - sum(u[m] for u, m in zip(utilities, top, strict=True))) / n
+    state_out.bias[:n], state_out.bias[2 * n], state_out.bias[2 * n + 1 :] = 1.0, scale, 40.0  # sigmoid(40) = 1
     return mixer
 
 
@@ -321,10 +323,10 @@ def represent(utilities, tables):
 
 def main():
     torch.set_num_threads(1)
-    print("Mac-IGM violations in 2,000 random situations: lambda free / literal at initialisation / conditioned")
+    print("Mac-IGM violations in 2,000 random situations: lambda free / literal at initialisation / as shipped")
     cases = [(agents, size, going) for agents in (2, 3, 4) for size in (2, 3, 5) for going in range(1, agents)]
     for agents, size, going in cases:
-        makes = (None, MIXERS["literal"], MIXERS["conditioned"])
+        makes = (None, MIXERS["literal"], MIXERS["as shipped"])
         counts = [breaks([size] * agents, going, 2_000, 0, make) for make in makes]
         print(f"{agents} agents, {size} macro-actions, {going} ongoing: {' / '.join(map(str, counts))}", flush=True)
     print(

@@ -190,12 +190,13 @@ def situations(sizes):
         yield tuple(m < 0 for m in state), tuple(max(m, 0) for m in state)
 
 
-def mac_igm_batch(q, utilities, terminated, ongoing, ties="equal"):
+def mac_igm_batch(q, utilities, terminated, ongoing, ties="equal", tolerance=0.0):
     """`mac_igm` for many tables at once, vectorised, in floating point; agrees with it exactly (a test says so).
 
     Args:
         q: float [batch, |M^1|, ..., |M^n|]. utilities: n float arrays [batch, |M^i|].
         terminated: bool [batch, n] or [n]. ongoing: int [batch, n] or [n]. ties: as in the module's docstring.
+        tolerance: float or float [batch]; a joint action that loses no more is a joint maximiser.
 
     Returns:
         holds: bool [batch].
@@ -217,7 +218,7 @@ def mac_igm_batch(q, utilities, terminated, ongoing, ties="equal"):
         greedy &= np.where(done, u == u.max(axis=1, keepdims=True), running).reshape(own_axis)
     joint_axes = tuple(range(1, q.ndim))
     top = np.where(open_, q, -np.inf).max(axis=joint_axes, keepdims=True)
-    best = open_ & (q == top)
+    best = open_ & (q >= top - np.reshape(tolerance, (-1,) + (1,) * len(sizes)))
     holds = {
         "equal": (best == greedy).all(axis=joint_axes),
         "every": (best | ~greedy).all(axis=joint_axes),
