@@ -29,7 +29,7 @@ import os
 import signal
 import sys
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -78,6 +78,8 @@ class Args:
     learning_starts: int = 5_000  # environment steps before the first update
     train_frequency: int = 64  # environment steps per gradient update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
+    obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
+    reward_scale: float = 1.0  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.0  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
     hysteresis_start: float = (
         1.0  # factor on negative TD errors at the start; 1 is the paper's loss, less is optimistic
@@ -92,23 +94,21 @@ class Args:
     def __post_init__(self):
         if self.env not in envs.IDS:
             fail(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
-        unbounded = "seed learning_starts checkpoint_frequency max_grad_norm".split()
+        shares = "learning_rate learning_rate_end gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end"
         for name, value in vars(self).items():
-            if type(value) in (int, float):  # others have their type checked by tyro
-                low = 0 if type(value) is float or name in unbounded else 1
-                high = 1 if type(value) is float and name not in unbounded else float("inf")
-                if not low <= value <= high:
-                    fail(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
+            low = type(value) is int and name not in ("seed", "learning_starts")
+            high = 1 if name in shares.split() else float("inf")
+            if type(value) in (int, float) and not low <= value <= high:  # tyro has checked the others' types
+                fail(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
 
 
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "wtd": {},
     "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
                td_lambda=0.5, hysteresis_start=0.3),
     "ct": dict(total_timesteps=600_000, num_envs=128, learning_rate=1e-3, learning_rate_end=0.0, gamma=0.9,
                buffer_size=5_000, exploration_timesteps=150_000, train_frequency=256, td_lambda=0.8,
-               hidden_size=32, eval_frequency=40_000, eval_episodes=400),
+               obs_scale=4.0, reward_scale=10.0,               hidden_size=32, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip
 
 
@@ -131,10 +131,10 @@ class Agents(nn.Module):
     n_actions: a list of n ints. obs_size: width d of the padded macro-observation. hidden_size: H.
     """
 
-    def __init__(self, n_actions, obs_size, hidden_size):
+    def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
         n, widest, bound = len(n_actions), max(n_actions), hidden_size**-0.5
-        self.n_actions, self.hidden_size = np.array(n_actions), hidden_size
+        self.n_actions, self.hidden_size, self.obs_scale = np.array(n_actions), hidden_size, obs_scale
         self.encoder = AgentLinear(n, obs_size + widest, hidden_size)
         self.gru_input = AgentLinear(n, hidden_size, 3 * hidden_size)
         self.gru_hidden = nn.Parameter(torch.empty(n, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
@@ -156,7 +156,7 @@ class Agents(nn.Module):
         Returns utilities float32 [n, M, A], -inf for macro-actions an agent does not have, and states [n, M, H].
         """
         one_hot = previous[..., None] == self.actions  # [n, M, A]
-        gates = self.gru_input(torch.relu(self.encoder(torch.cat([obs, one_hot], 2))))  # [n, M, 3 H]
+        gates = self.gru_input(torch.relu(self.encoder(torch.cat([self.obs_scale * obs, one_hot], 2))))  # [n, M, 3 H]
         states = []
         for step in gates.split(sizes, 1):
             hidden = hidden[:, : step.shape[1]]
@@ -175,7 +175,7 @@ def over_rows(batch, *networks):
     A macro-history moves only where its agent chooses, so the networks run over each agent's own decisions, a fraction
     of the rows: packed as Agents.forward wants them, and unpacked to the rows, which look up the latest decision.
     """
-    own = batch["chosen"].permute(2, 0, 1).clone()  # [n, B, T]
+    own = batch["chosen"].movedim(2, 0).clone()  # [n, B, T]
     own[..., 0] = True  # a window starts with what every agent saw last
     count = own.cumsum(2)  # [n, B, T], decisions up to the row
     length, agents = count[..., -1], torch.arange(len(own), device=own.device)[:, None, None]  # [n, B], [n, 1, 1]
@@ -185,10 +185,10 @@ def over_rows(batch, *networks):
     obs = batch["obs"].new_zeros(len(own), int(sizes.sum()), batch["obs"].shape[3])  # [n, M, d]
     previous = batch["previous"].new_zeros(obs.shape[:2])  # [n, M]
     # rows with the same latest decision write the same, what the agent saw and did before it
-    obs[agents, entry], previous[agents, entry] = batch["obs"].permute(2, 0, 1, 3), batch["previous"].permute(2, 0, 1)
+    obs[agents, entry], previous[agents, entry] = batch["obs"].movedim(2, 0), batch["previous"].movedim(2, 0)
     sizes = sizes[sizes > 0].tolist()
     packed = (network(obs, previous, network.start(sizes[0]), sizes)[0] for network in networks)
-    return [utilities[agents, entry].permute(1, 2, 0, 3) for utilities in packed]
+    return [utilities[agents, entry].movedim(0, 2) for utilities in packed]
 
 
 class QPLEXMixer(nn.Module):
@@ -233,81 +233,74 @@ class QPLEXMixer(nn.Module):
 
 
 class ReplayBuffer:
-    """Whole episodes of rows. The macro-state of an agent is the state of the row since which it runs its macro-action.
+    """Whole episodes of rows (Fig. 2), one array [capacity + N, horizon + 1, ...] for each field of a row.
 
-    data: rows [capacity + N, horizon + 1], of the episodes that are being written, one in each environment, and of ended
-    ones and free places, which are in a queue, the newest last: a window cannot reach into another episode.
+    An agent's macro-state is the state of the row since which it runs its macro-action. `writing` are the episodes that
+    run in the environments, `queue` the ended ones (and free places, of no rows), the oldest first.
     """
 
-    def __init__(self, env, capacity, gamma, mixer_state):
-        n, d = env.single_observation_space.shape
-        row = [  # Fig. 2
-            ("obs", np.float32, (n, d)),  # what every agent last saw
-            ("action", np.int64, n),  # the macro-action that it runs
-            ("since", np.int64, n),  # and since which row: its macro-history moves where that is this one
-            ("state", np.float32, env.state_size),
-            ("real", np.float32, env.state_size),  # the state a step before the next row
-            ("reward", np.float32),  # sum of gamma^t r_t until the next row
-            ("discount", np.float32),  # gamma^tau, 0 where the episode terminated
-        ]
-        self.data = np.zeros((capacity + env.num_envs, env.horizon + 1), np.dtype(row, align=True))
-        self.rows = np.zeros(len(self.data), int)  # of each episode
-        self.queue, self.writing = np.split(np.arange(len(self.data)), [capacity])
-        self.gamma, self.mixer_state, self.size = gamma, mixer_state, 0
+    def __init__(self, env, capacity):
+        (n, d), state = env.single_observation_space.shape, (env.state_size,)
+        fields = {
+            "obs": ((n, d), np.float32),  # what every agent last saw
+            "action": ((n,), np.int64),  # the macro-action that it runs
+            "since": ((n,), np.int64),  # and since which row: its macro-history moves where that is this one
+            "state": (state, np.float32),
+            "real": (state, np.float32),  # the state a step before the next row
+            "reward": ((), np.float32),  # sum of gamma^t r_t until the next row
+            "discount": ((), np.float32),  # gamma^tau, 0 where the episode terminated
+        }
+        for name, (shape, kind) in fields.items():
+            setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
+        self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
+        self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
 
     def add(self, obs, actions, chosen, state):
         """Notes a row wherever an agent chooses: float32 [N, n, d], int64 [N, n], bool [N, n], float32 [N, S]."""
         env = np.flatnonzero(chosen.any(1))
-        episode, row = self.writing[env], self.rows[self.writing[env]]
-        since = np.where(chosen[env], row[:, None], self.data["since"][episode, row - 1])
-        new = dict(obs=obs[env], action=actions[env], since=since, state=state[env], reward=0, discount=1)
-        for key, value in new.items():
-            self.data[key][episode, row] = value
+        at = episode, row = self.writing[env], self.rows[self.writing[env]]
+        since = np.where(chosen[env], row[:, None], self.since[episode, row - 1])
+        self.obs[at], self.action[at], self.since[at], self.state[at] = obs[env], actions[env], since, state[env]
+        self.reward[at], self.discount[at] = 0.0, 1.0
         self.rows[episode] += 1
 
-    def reward(self, rewards, state):
-        """Adds a step's rewards, float64 [N], to the running rows: r += gamma^t r_t. state: the one before the step."""
+    def step(self, rewards, discounts, state):
+        """Adds a step to the running rows: r += gamma^t r_t. float64 [N] (0 at a terminal step), state before it."""
         at = self.writing, self.rows[self.writing] - 1
-        self.data["reward"][at] += self.data["discount"][at] * rewards
-        self.data["discount"][at] *= self.gamma
-        self.data["real"][at] = state
+        self.reward[at] += self.discount[at] * rewards
+        self.discount[at] *= discounts
+        self.real[at] = state
 
-    def finish(self, over, terminated, obs, infos):
-        """Ends the episodes in over, bool [N], with their final observation."""
-        at = self.writing[over], self.rows[self.writing[over]] - 1
-        self.data["discount"][at] *= ~terminated[over]  # a truncated episode bootstraps
+    def finish(self, over, obs, infos):
+        """Ends the episodes in over, bool [N], with a row for their final observation."""
         self.add(obs, infos["macro_action"], infos["macro_done"] & over[:, None], infos["state"])
-        queue, count = np.append(self.queue, self.writing[over]), over.sum()
-        self.writing[over], self.queue = queue[:count], queue[count:]
+        queue = np.append(self.queue, self.writing[over])
+        self.writing[over], self.queue = np.split(queue, [over.sum()])
         self.rows[self.writing[over]] = 0
-        self.size = min(self.size + count, len(queue) - count)
 
-    def sample(self, batch_size, window, rng, device="cpu"):
+    def sample(self, batch_size, window, mixer_state, rng, device="cpu"):
         """Windows of random episodes, in which every row is as likely as any other: a dict of tensors [B, T, ...].
 
         T = window + 1: `valid` marks the rows that have a next one, at which the target looks. Windows reach over both
         ends of an episode and are cut there: had all to fit in, the last row, often the one with the reward, were rare.
         """
-        episode = self.queue[rng.integers(self.size, size=(batch_size, 1)) - self.size]
+        ended = self.queue[self.rows[self.queue] > 0]
+        episode = ended[rng.integers(len(ended), size=(batch_size, 1))]
         last = self.rows[episode] - 1  # [B, 1], the row of the final observation
         start = rng.integers(1 - window, last)
         end, row = np.minimum(start + window, last), np.maximum(start, 0) + np.arange(window + 1)  # [B, 1], [B, T]
-        valid, inside, row = row < end, row <= end, np.minimum(row, end)
-        rows, episodes = self.data[episode, row], episode[..., None]  # [B, T], [B, 1, 1]
-        since, state = rows["since"], rows["state"]  # [B, T, n], [B, T, S]
-        chosen = (since == row[..., None]) & inside[..., None]  # [B, T, n]
-        before = self.data["action"][episodes, since - 1, np.arange(since.shape[2])]  # [B, T, n]
-        batch = {key: rows[key] for key in ("obs", "action", "reward", "discount")}
-        batch |= dict(
-            valid=valid, chosen=chosen, previous=np.where(since > 0, before, -1), state=state, next_state=state
-        )
-        if self.mixer_state == "joint":
-            batch["state"] = batch["next_state"] = self.data["state"][episodes, since].reshape(*row.shape, -1)
-        elif self.mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
-            agent = np.roll(chosen, -1, 1).argmax(2)[..., None]  # [B, T, 1]
-            batch["state"] = self.data["state"][episode, np.take_along_axis(since, agent, 2)[..., 0]]
-        elif self.mixer_state == "real":
-            batch["state"] = rows["real"]
+        at, episodes = (episode, np.minimum(row, end)), episode[..., None]
+        since, agents = self.since[at], np.arange(self.since.shape[2])  # [B, T, n], [n]
+        batch = {key: getattr(self, key)[at] for key in ("obs", "action", "state", "reward", "discount")}
+        previous = np.where(since > 0, self.action[episodes, since - 1, agents], -1)  # [B, T, n]
+        batch |= dict(valid=row < end, chosen=since == row[..., None], previous=previous, next_state=batch["state"])
+        if mixer_state == "joint":
+            batch["state"] = batch["next_state"] = self.state[episodes, since].reshape(*row.shape, -1)
+        elif mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
+            agent = np.roll(batch["chosen"], -1, 1).argmax(2)[..., None]  # [B, T, 1]
+            batch["state"] = self.state[episode, np.take_along_axis(since, agent, 2)[..., 0]]
+        elif mixer_state == "real":
+            batch["state"] = self.real[at]
         return {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
 
 
@@ -368,13 +361,17 @@ def evaluate(agents, env, gamma, seed):
     Returns a dict of float64 [N]: return, discounted_return, length, success (0 or 1).
     """
     obs, infos = env.reset(seed=seed)
-    hidden, live, step = agents.start(env.num_envs), np.ones(env.num_envs, bool), 0
-    result = {key: np.zeros(env.num_envs) for key in ("return", "discounted_return", "length", "success")}
+    hidden, live, step, result = agents.start(env.num_envs), np.ones(env.num_envs, bool), 0, {}
     while live.any():
         actions, hidden = act(agents, obs, infos, hidden)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        for key, value in zip(result, (rewards, gamma**step * rewards, 1, infos["success"]), strict=True):
-            result[key] += live * value
+        gains = {
+            "return": rewards,
+            "discounted_return": gamma**step * rewards,
+            "length": 1,
+            "success": infos["success"],
+        }
+        result = {key: result.get(key, 0.0) + live * gain for key, gain in gains.items()}
         over, step = terminations | truncations, step + 1
         live &= ~over
         if over.any():  # play on in ended environments without looking
@@ -385,7 +382,8 @@ def evaluate(agents, env, gamma, seed):
 
 def make_learner(args, env):
     """Agents and mixer as one module on the device."""
-    agents = Agents(env.n_actions, env.single_observation_space.shape[1], args.hidden_size)
+    sizes = env.single_observation_space.shape[1], args.hidden_size, args.obs_scale
+    agents = Agents(env.n_actions, *sizes)
     width = env.state_size * (env.n_agents if args.mixer_state == "joint" else 1)
     mixer = QPLEXMixer(env.n_actions, width, args.mixing_embed, mask_ongoing=args.mask_ongoing)
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device)
@@ -399,9 +397,10 @@ def train(args, stop=()):
     env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
     learner = make_learner(args, env)
     target, agents = copy.deepcopy(learner).requires_grad_(False), learner["agents"]
-    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
-    networks, buffer = (learner, target, optimizer), ReplayBuffer(env, args.buffer_size, args.gamma, args.mixer_state)
-    memory = buffer.data, buffer.rows, buffer.queue, buffer.writing
+    fast, slow = list(learner.parameters()), list(target.parameters())
+    optimizer = torch.optim.Adam(fast, lr=args.learning_rate, fused=True)
+    average = torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)
+    networks, buffer = (learner, target, optimizer), ReplayBuffer(env, args.buffer_size)
     obs, infos = env.reset(seed=args.seed)
     hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
     folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
@@ -410,17 +409,16 @@ def train(args, stop=()):
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
     if args.resume:
-        saved, _ = load(folder / "checkpoint.pt")
+        saved = load(folder / "checkpoint.pt")
         for part, state in zip(networks, saved["networks"], strict=True):
             part.load_state_dict(state)
-        for array, content in zip(memory, saved["memory"], strict=True):
-            array[:] = content.numpy().view(array.dtype)
+        vars(buffer).update({key: value.numpy() for key, value in saved["buffer"].items()})
         obs, infos = env.load_state(saved["env"])
         rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
-        step, updates, recent, best, buffer.size = saved["progress"]
+        step, updates, recent, best = saved["progress"]
     else:
         folder.mkdir(parents=True)
-        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2) + "\n")
+        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
         os.replace(folder / "args.json.new", folder / "args.json")
     writer, bar = (
         SummaryWriter(folder, purge_step=step + 1),
@@ -432,57 +430,53 @@ def train(args, stop=()):
         for key, value in values.items():
             writer.add_scalar(f"{group}/{key}", value, step)
 
-    def due(frequency):
-        return step % frequency < args.num_envs or step >= args.total_timesteps
-
     while step < args.total_timesteps and not stop:
         # Choose and step
         progress, done = min(1.0, step / args.exploration_timesteps), step / args.total_timesteps
         epsilon = args.start_e + progress * (args.end_e - args.start_e)
         if args.learning_rate_end is not None:
             optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
-        actions, moved = act(agents, obs, infos, hidden, epsilon, rng)
+        actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.add(obs, actions, infos["macro_done"], state)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        buffer.reward(rewards, state)
-        hidden, step = moved, step + args.num_envs
+        buffer.step(args.reward_scale * rewards, np.float32(args.gamma) * ~terminations, state)
+        step += args.num_envs
         bar.update(args.num_envs)
 
         # Store the episodes that ended and start new ones
         over = terminations | truncations
         if over.any():
-            buffer.finish(over, terminations, obs, infos)
-            recent += zip(env.episode_return[over].tolist(), env.elapsed[over].tolist(), strict=True)
+            buffer.finish(over, obs, infos)
+            recent += env.episode_return[over].tolist()
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
 
         # Learn
-        while updates < (step - args.learning_starts) // args.train_frequency and buffer.size:
-            batch = buffer.sample(args.batch_size, args.window, rng, args.device)
+        while updates < (step - args.learning_starts) // args.train_frequency and buffer.rows[buffer.queue].any():
+            batch = buffer.sample(args.batch_size, args.window, args.mixer_state, rng, args.device)
             utilities = over_rows(batch, agents, target["agents"])
             beta = args.hysteresis_start + progress * (args.hysteresis_end - args.hysteresis_start)
             loss, joint_q, _ = td_loss(*utilities, learner["mixer"], target["mixer"], batch, args.td_lambda, beta)
             optimizer.zero_grad()
             loss.backward()
-            grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
+            grad_norm = nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
             optimizer.step()
-            for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
-                slow.data.lerp_(fast.data, 1 - args.polyak)
+            average(slow, fast, None)
             updates += 1
             if updates % 100 == 0:
                 log("losses", td_loss=loss, q_values=joint_q.mean(), grad_norm=grad_norm)
 
         # Log, evaluate, save
-        if due(2_000) and recent:
-            sps, (mean_return, mean_length) = (step - first_step) / (time.time() - started), np.mean(recent, 0)
-            log("charts", SPS=sps, epsilon=epsilon, episodic_return=mean_return, episodic_length=mean_length)
+        if step % 2_000 < args.num_envs and recent:
+            sps = (step - first_step) / (time.time() - started)
+            log("charts", SPS=sps, epsilon=epsilon, episodic_return=np.mean(recent))
             recent = []
-        if due(args.eval_frequency):
-            eval_seed = int(np.random.SeedSequence([args.seed, step]).generate_state(1)[0])
-            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, eval_seed).items()}
+        if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
+            seed = args.seed * 10**9 + step  # fresh episodes
+            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, seed).items()}
             log("eval", **result)
-            model = {"step": step, "return": result["return"], "networks": learner.state_dict()}
+            model = dict(step=step, networks=learner.state_dict(), **result)
             save(folder / "last.pt", args, **model)
             if result["return"] >= best:
                 best = result["return"]
@@ -491,10 +485,9 @@ def train(args, stop=()):
         if time.time() - saved_at > args.checkpoint_frequency or stop:
             writer.flush()  # what was logged up to here is not logged again after a resume
             arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
-            save(folder / "checkpoint.pt", args, networks=[part.state_dict() for part in networks],
-                 memory=[torch.from_numpy(array.view(np.uint8)) for array in memory], env=arrays,
-                 rng=rng.bit_generator.state, hidden=hidden,
-                 progress=(step, updates, recent, best, buffer.size))  # fmt: skip
+            save(folder / "checkpoint.pt", args, networks=[part.state_dict() for part in networks], hidden=hidden,
+                 buffer={key: torch.from_numpy(value) for key, value in vars(buffer).items()}, env=arrays,
+                 rng=rng.bit_generator.state, progress=(step, updates, recent, best))  # fmt: skip
             saved_at = time.time()
 
     bar.close()
@@ -511,12 +504,12 @@ def save(path, args, **content):
 
 
 def load(path):
-    """What `save` wrote, on the CPU, and its Args."""
+    """What `save` wrote, on the CPU."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
         if saved["algorithm"] != ALGORITHM:
             fail(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
-        return saved, Args(**saved["args"])
+        return saved
     except Exception as error:  # torch names no common class for what a damaged file raises
         fail(f"cannot read {path}: {str(error).splitlines()[0]}")
 
@@ -524,14 +517,16 @@ def load(path):
 def parse_args(argv=None):
     """Args from the command line, over the defaults of the task's family or the settings of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    peek.add_argument("--env", default=Args.env)
+    peek.add_argument("--env")
     peek.add_argument("--resume")
-    known = peek.parse_known_args(argv)[0]
-    family = DEFAULTS.get(known.env.split("-")[0], {})
-    base = load(Path(known.resume) / "checkpoint.pt")[1] if known.resume else Args(env=known.env, **family)
-    args = tyro.cli(Args, default=base, args=argv)
-    if known.resume and args != replace(base, resume=args.resume, device=args.device):
-        fail("--resume goes on with the run's own settings: only --device can be given with it")
+    known, others = peek.parse_known_args(argv)
+    if known.resume:
+        if known.env or others:
+            fail("--resume goes on with the run's own settings: no other flag can be given with it")
+        args = Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
+    else:
+        env = known.env or Args.env
+        args = tyro.cli(Args, default=Args(env=env, **DEFAULTS.get(env.split("-")[0], {})), args=argv)
     if args.device == "cuda" and not torch.cuda.is_available():
         fail("--device cuda: there is none")
     return args

@@ -7,7 +7,9 @@ RUNS are folders with a runs.csv (see record.py), run folders, or folders of the
 half a grid is a report of that half. Algorithms with the same variant are compared, and the variants of an algorithm.
 """
 
+import argparse
 import json
+import re
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -57,7 +59,7 @@ PAPER = {
 
 
 class Section(NamedTuple):
-    """What a figure and its tables compare: runs on a task, by their column `label`. columns of runs: see `read_runs`."""
+    """What a figure and its tables compare: runs on a task, as from `read_runs`, by their column `label`."""
 
     title: str
     env: str
@@ -98,7 +100,7 @@ def interval(samples, statistic):
     """
     if min(x.shape[-1] for x in samples) < 2:
         return np.full((2, *samples[0].shape[:-1]), np.nan)
-    options = dict(n_resamples=RESAMPLES, vectorized=True, method="percentile", rng=0)
+    options = dict(n_resamples=RESAMPLES, vectorized=True, axis=-1, method="percentile", rng=0)
     return np.stack(stats.bootstrap(samples, statistic, **options).confidence_interval)
 
 
@@ -145,7 +147,7 @@ def read_runs(paths, warn):
 
 
 def make_sections(runs):
-    """The sections of a report: on each task the algorithms, by variant, and the variants of algorithms that have some."""
+    """The sections of a report: on each task the algorithms by variant, then the variants of those that have some."""
     names = runs["algorithm"].map(lambda name: ALGORITHMS.get(name, (name,))[0])
     for env, on_task in runs.groupby("env", sort=False):
         variants = on_task.groupby("algorithm")["variant"].transform("nunique")
@@ -220,15 +222,13 @@ def write_figures(sections, evaluations, output):
 
 def first_sections(sections):
     """The first section of each task, by task."""
-    return {
-        env: next(section for section in sections if section.env == env)
-        for env in dict.fromkeys(s.env for s in sections)
-    }
+    last_first = {section.env: section for section in reversed(sections)}
+    return dict(reversed(last_first.items()))
 
 
 def file_of(section):
     """The name of a section's figure."""
-    return section.title.replace(": variants of ", "__").replace(": ", "__").replace(" ", "_") + ".png"
+    return re.sub(r"[^\w=.-]+", "_", section.title) + ".png"
 
 
 def table(head, rows):
@@ -262,9 +262,9 @@ def performance_table(section):
                      f"{of['success'].mean():.2f}", f"{paper[0]:g} ± {paper[1]:g}" if paper else "",
                      f"{of['seconds'].mean() / 60:.1f} min"])  # fmt: skip
     for kind, x in REFERENCES.get(section.env, {}).items():
-        rows.append([f"*{kind}: {x.get('name', 'uniform')}*", "", f"{x['episodes']:,} episodes",
-                     f"{x['return']:.{digits}f} ± {x['se']:.{digits}f}", "", "",
-                     f"{x['discounted_return']:.{digits}f}", f"{x['success']:.2f}", "", ""])  # fmt: skip
+        value = f"{x['return']:.{digits}f} ± {x['se']:.{digits}f}"
+        discounted = f"{x['discounted_return']:.{digits}f}"
+        rows.append([f"*{x.get('name', kind)}*", "", "", value, "", "", discounted, f"{x['success']:.2f}", "", ""])
     return table(["", "runs", "steps", "return: mean ± SE", "IQM [95%]", "solved [95%]", "discounted: mean ± SE",
                   "success", "paper", "time per run"], rows)  # fmt: skip
 
@@ -279,34 +279,85 @@ def comparison_table(samples):
 
 
 def over_tasks(sections):
-    """IQM of the final returns by task, and of all tasks together where an algorithm has runs on all of them."""
+    """IQM on each task and over all of them, for the algorithms that were run on all; and their comparison."""
     cells, scaled = {}, {}
     for env, section in sections.items():
-        x = REFERENCES.get(env)
+        known = REFERENCES.get(env, {})
+        low, high = (known.get(kind, {}).get("return", np.nan) for kind in ("random", "scripted"))
         for label, of in section.groups:
             cells.setdefault(label, {})[env] = with_interval([of["return"]], iqm, section.digits)
-            if x:
-                share = (of["return"] - x["random"]["return"]) / (x["scripted"]["return"] - x["random"]["return"])
-                scaled.setdefault(label, {})[env] = share.to_numpy()
-    everywhere = {name: list(of.values()) for name, of in scaled.items() if len(sections) == len(of) > 1}
-    rows = [
-        [
-            name,
-            *(of.get(env, "") for env in sections),
-            with_interval(everywhere[name], iqm, 3) if name in everywhere else "",
-        ]
-        for name, of in cells.items()
-    ]
-    return table(["", *sections, "all, scaled"], rows), comparison_table(everywhere)
+            scaled.setdefault(label, []).append(((of["return"] - low) / (high - low)).to_numpy())
+        for kind, x in known.items():
+            cells.setdefault(f"*{kind} policy*", {})[env] = f"{x['return']:.{section.digits}f}"
+    everywhere = {name: samples for name, samples in scaled.items() if len(samples) == len(sections)}
+    for name, samples in everywhere.items():
+        cells[name]["all, scaled"] = with_interval(samples, iqm, 3)
+    columns = [*sections, "all, scaled"]
+    cells = {name: cells[name] for name in sorted(cells, key=lambda name: name[0] == "*")}  # the references last
+    text = table(["", *columns], [[name, *(of.get(column, "") for column in columns)] for name, of in cells.items()])
+    return text + "Over all tasks (of algorithms that have runs on each):\n\n" + comparison_table(everywhere)
 
 
-def commands(runs):
-    """A table of the command lines behind the runs, with SEED in place of the seed."""
-    rows, same = [], ["algorithm", "env", "flags", "commit", "checksum", "processor"]
-    for (algorithm, env, flags, *others), of in runs.groupby(same, sort=False):
-        words = [f"python {algorithm}.py --env {env} --seed SEED"]
-        for name, _, value in (flag.partition("=") for flag in flags.split()):
-            flag = name.replace("_", "-")
-            words.append({"True": f"--{flag}", "False": f"--no-{flag}"}.get(value, f"--{flag} {value}"))
-        rows.append([f"`{' '.join(words)}`", " ".join(map(str, of["seed"])), *others])
-    return table(["command", "seeds", "commit", "code", "processor"], rows)
+def sources(runs):
+    """A table of what was run, by which code."""
+    same = ["algorithm", "env", "flags", "commit", "checksum", "processor"]
+    seeds = runs.groupby(same, sort=False)["seed"].agg(lambda of: " ".join(map(str, of))).reset_index()
+    return table(list(seeds), seeds.to_numpy())
+
+
+def markdown(sections, runs, notes, figures):
+    """The report's text."""
+    text = f"""# Results
+
+Returns of greedy policies. A run's final performance is the mean of its last {LAST} evaluations; a row is over its
+runs, one for each seed. SE: standard error. IQM: interquartile mean, a quarter of the runs, rounded down, left out at
+either end, with the 95% interval of {RESAMPLES:,} bootstrap resamples, stratified by task. Solved: runs with
+{SOLVED:.0%} of the optimal return or more in each of these {LAST} evaluations, with the exact 95% interval of Clopper and
+Pearson. P(row > column): the probability that a run of the row ends above one of the column; ties count half. Scaled:
+the random policy has 0 and the scripted policy 1. The paper says neither whether its returns are discounted nor what its
+± is. Time per run is wall-clock, beside whatever else the machine did.
+
+"""
+    if runs.groupby(["env", "algorithm", "variant"]).size().min() < 10:
+        text += "**Few seeds.** Bootstrap intervals of less than ten runs know nothing of outcomes that none of the runs\n"
+        text += "had, and tend to be too narrow.\n\n"
+    text += "".join(f"![{name}]({name}.png)\n\n" for name in figures)
+    text += f"IQM of the final returns [95%]:\n\n{over_tasks(first_sections(sections))}"
+    for section in sections:
+        text += f"## {section.title}\n\n![{section.title}]({file_of(section)})\n\n{performance_table(section)}"
+        steps = section.groups["step"].max()
+        if steps.max() > 1.01 * steps.min():  # a run may go on to a whole step of its environments
+            text += "**The rows differ in their environment steps**: this is not a comparison at equal budgets.\n\n"
+        if section.groups["checksum"].nunique().max() > 1:
+            text += "**Some rows have runs of several versions of the code.**\n\n"
+        text += comparison_table({label: [of["return"]] for label, of in section.groups})
+    text += "## Sources\n\nA flag name=value is --name value on the command line of python ALGORITHM.py --env ENV "
+    text += f"--seed SEED. The checksum is of the script and envs/*.py.\n\n{sources(runs)}"
+    return text + "".join(f"- {note}\n" for note in notes)
+
+
+def main(argv=None):
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="*", default=[record.RESULTS], metavar="RUNS", help="default: benchmark/results")
+    parser.add_argument("-o", "--output", type=Path, default=record.RESULTS, help="folder (default: benchmark/results)")
+    args = parser.parse_args(argv)
+    notes = []
+
+    def warn(note):
+        print(f"report: {note}", file=sys.stderr)
+        notes.append(note)
+
+    runs, evaluations = read_runs(args.runs, warn)
+    sections = list(make_sections(runs))
+    try:
+        args.output.mkdir(parents=True, exist_ok=True)
+        figures = write_figures(sections, evaluations, args.output)
+        (args.output / "README.md").write_text(markdown(sections, runs, notes, figures))
+    except OSError as error:
+        fail(f"cannot write to {args.output}: {error.strerror}")
+    print(args.output / "README.md")
+
+
+if __name__ == "__main__":
+    main()

@@ -151,7 +151,8 @@ def play(env_id, policy, episodes, seed, gamma):
 def reference(env_id, policy, episodes, seed=0):
     """Means over episodes, with the standard error of the return; rounded, so that files can be compared."""
     result = play(env_id, policy, episodes, seed, GAMMA[env_id.split("-")[0]])
-    means = {key: x.mean() for key, x in result.items()} | {"se": result["return"].std(ddof=1) / episodes**0.5}
+    error = result["return"].std(ddof=1) / episodes**0.5
+    means = {"return": 0.0, "se": error} | {key: x.mean() for key, x in result.items()}
     return {key: round(float(x), 6) for key, x in means.items()} | {"episodes": episodes}
 
 

@@ -20,6 +20,7 @@ While a process works on a run, its log in <runs-dir>/logs is locked (flock), so
 import argparse
 import fcntl
 import importlib
+import itertools
 import json
 import os
 import re
@@ -64,9 +65,10 @@ if os.getppid() == int(sys.argv[1]):
     sys.exit(code if code >= 0 else 128 - code)"""
 
 
-# A job is a dict: the KEY of a run (see record.py), as text, with variant, options (the words behind --) and runs_dir,
-# and how it ended: recorded, skipped, finished, failed, stopped, or busy where another process works on it.
-NOT_RUN = {"result": "recorded", "folder": None, "attempts": 0, "seconds": 0.0, "error": ""}
+# A job is a dict: the KEY of a run (see record.py), as text, with variant, options (the words behind --), runs_dir and
+# arguments (the content of args.json), and how it ended: recorded, skipped, finished, failed, stopped, or busy where
+# another process works on it.
+NOT_RUN = {"result": "recorded", "return": "-", "time": "-", "attempts": 0, "folder": "-", "error": ""}
 
 
 def fail(message):
@@ -110,7 +112,9 @@ def run_job(job):
     started, attempts, code, error, folder = time.time(), 0, None, "", None
 
     def ended(result):
-        return job | dict(result=result, folder=folder, attempts=attempts, seconds=time.time() - started, error=error)
+        spent = timedelta(seconds=round(time.time() - started))
+        unsolved = error if result == "failed" else ""
+        return job | dict(result=result, folder=folder or "-", attempts=attempts, time=str(spent), error=unsolved)
 
     with open(log_path(job), "a") as log:
         # The script inherits the lock with its output: the run is free when the script has ended, too.
@@ -169,7 +173,7 @@ def run_script(job, folder, log):
                 process.send_signal(number)
                 passed += 1
             for made in set(run_folders(job)) - before:  # by this script, or by one with other flags beside it
-                if record.describe(made)["flags"] == job["flags"]:
+                if json.loads((made / "args.json").read_text()) == job["arguments"]:
                     record.replace_text(made / record.ORIGIN, json.dumps(origin, indent=2) + "\n")
                 before.add(made)
             time.sleep(0.1)
@@ -214,17 +218,16 @@ def run_jobs(jobs, args):
                 job = pending.pop(future)
                 try:
                     job = future.result()
-                    if args.record and job["result"] in ("finished", "skipped"):
+                    if job["result"] in ("finished", "skipped"):
                         run, evaluations = record.read_folder(job["folder"])
-                        record.add(args.record, run | {"variant": job["variant"]}, evaluations)
+                        job["return"] = evaluations["return"].iloc[-1]
+                        if args.record:
+                            record.add(args.record, run | {"variant": job["variant"]}, evaluations)
                 except Exception as error:  # the engine's own: an unwritable log, or workers lost once too often
                     job |= {"result": "stopped" if stop else "failed", "error": repr(error).strip().splitlines()[-1]}
                 results.append(job)
-                seconds, value = timedelta(seconds=round(job["seconds"])), record.last_evaluation(job["folder"])[1]
-                line = (
-                    f"[{len(results)}/{len(jobs)}] {name(job)}: {job['result']}, {seconds}, greedy return {value:.2f}"
-                )
-                tqdm.write(line, sys.stderr)
+                line = f"[{len(results)}/{len(jobs)}] {name(job)}: {job['result']}, {job['time']}"
+                tqdm.write(f"{line}, greedy return {job['return']}", sys.stderr)
                 bar.update()
             if len(stop) > interrupted:
                 interrupted = len(stop)
@@ -238,15 +241,9 @@ def run_jobs(jobs, args):
 
 def table(results):
     """Results as a table, and below it a line for each failure."""
-    frame = pd.DataFrame(results)
-    frame["return"] = [record.last_evaluation(folder)[1] for folder in frame["folder"]]
-    frame["time"] = [str(timedelta(seconds=round(seconds))) for seconds in frame["seconds"]]
     columns = ["algorithm", "env", "seed", "result", "return", "time", "attempts", "folder"]
-    lines = [frame[columns].to_string(index=False, float_format="%.2f", na_rep="-")]
-    for job in results:
-        if job["result"] == "failed":
-            lines.append(f"{name(job)} failed: {job['error']} (log: {log_path(job)})")
-    return "\n".join(lines)
+    failed = [f"{name(job)} failed: {job['error']} (log: {log_path(job)})" for job in results if job["error"]]
+    return "\n".join([pd.DataFrame(results)[columns].to_string(index=False), *failed])
 
 
 def parse_seeds(text):
@@ -274,13 +271,14 @@ def make_jobs(args, options):
             raise
         if any(arguments[name] != usual[name] for name in ("env", "seed", "runs_dir")):
             fail("--env, --seed and --runs-dir cannot stand behind --, the sweep sets them")
-        cells.append((algorithm, env, record.flags_of(algorithm, arguments), record.checksum(algorithm)))
+        cells.append((algorithm, env, record.flags_of(algorithm, arguments), record.checksum(algorithm), arguments))
     jobs = []  # all of the first seed before the second, so that a sweep of days soon shows something of everything
-    for seed in dict.fromkeys(sum(args.seeds, [])):
-        for algorithm, env, flags, checksum in cells:
+    for seed in dict.fromkeys(itertools.chain.from_iterable(args.seeds)):
+        for algorithm, env, flags, checksum, arguments in cells:
             jobs.append({"algorithm": algorithm, "env": env, "flags": flags, "seed": str(seed), "checksum": checksum,
                          "variant": flags if args.variant is None else args.variant, "options": options,
-                         "runs_dir": args.runs_dir} | NOT_RUN)  # fmt: skip
+                         "runs_dir": args.runs_dir, "arguments": {"algorithm": algorithm, **arguments, "seed": seed},
+                         **NOT_RUN})  # fmt: skip
     return jobs
 
 
@@ -316,10 +314,11 @@ def main(argv=None):
     args, options = parse_args(argv)
     jobs, recorded = make_jobs(args, options), set()
     try:
+        if not args.dry_run:
+            for folder in filter(None, (args.record, Path(args.runs_dir) / "logs")):
+                folder.mkdir(parents=True, exist_ok=True)
         if args.record:
             recorded = {key(run) for run in record.load(args.record)[0].to_dict("records")}
-        if not args.dry_run:
-            (Path(args.runs_dir) / "logs").mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
         fail(f"cannot use --record or --runs-dir: {error}")
     todo = [job for job in jobs if key(job) not in recorded]

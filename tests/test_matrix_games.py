@@ -2,7 +2,7 @@
 
 Value-based algorithms play uniformly while they learn, so that the data do not depend on the learner, with the plain
 loss: one-row targets, no hysteresis. What was learned is read twice: the payoff of the greedy choices, and the joint
-values of the nine first joint macro-actions, by the script's own loss code. With `tell`, all of them can value the
+values of the nine first joint macro-actions, as the script's own loss says them. With `tell`, all of them can value the
 later rows exactly: the first row is the game and nothing else.
 
 Not shown: that QPLEX finds the optimum of every non-monotonic game by the plain loss. It can represent Son et al.'s (8,
@@ -10,9 +10,10 @@ Not shown: that QPLEX finds the optimum of every non-monotonic game by the plain
 has no joint values and learns from its own policy's play; it is here for completeness.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
-import torch
 
 import avf_qmix
 import avf_qplex
@@ -21,12 +22,14 @@ import cen_maddrqn
 import dec_maddrqn
 import envs
 import mac_iaicc
+from tests.curves import scalars
 from tests.matrix_game import MatrixGame
 
 ADDITIVE = np.add.outer([0.0, 3.0, 1.0], [2.0, 0.0, 5.0])  # best (b, c): 8
 MONOTONIC = np.array([(8.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])  # both are needed
 RISKY = np.array([(8.0, -12.0, -12.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])  # agent 0 risks something, agent 1 nothing
 
+VALUES = [avf_vdn, avf_qmix, avf_qplex, cen_maddrqn]  # those that have a joint value
 SEED = 1
 # One setting per game, the same for every algorithm that learns values. A bigger step is enough where all goes well.
 SETTINGS = {
@@ -38,11 +41,14 @@ SETTINGS = {
 
 @pytest.fixture
 def play(monkeypatch, tmp_path):
-    """play(script, game, **options) trains and returns the payoff of the greedy choices and the joint values [3, 3]."""
+    """play(script, game, **options) trains and returns the payoff of the greedy choices and the joint values [3, 3].
 
-    def play(script, game, **options):
+    scale: factor on what the learner is paid.
+    """
+
+    def play(script, game, scale=1.0, **options):
         payoff, updates, setting = SETTINGS[game]
-        monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, dict(payoff=payoff, tell=True)))
+        monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, dict(payoff=scale * payoff, tell=True)))
         monkeypatch.setattr(envs, "IDS", (*envs.IDS, "matrix"))
         options = setting | options
         if script is not mac_iaicc:
@@ -50,34 +56,28 @@ def play(monkeypatch, tmp_path):
                            end_e=1.0, batch_size=32, window=3, buffer_size=500, polyak=0.95)  # fmt: skip
             options = uniform | options
         shared = dict(env="matrix", seed=SEED, runs_dir=str(tmp_path), gamma=1.0, hidden_size=32, eval_episodes=1)
-        args = script.Args(**shared, **options)
-        model = script.load_file(script.train(args), "model.pt", "matrix")["last"]
-        if script is mac_iaicc:
-            return model["return"], None
-        learner, _ = script.make_learner(args, envs.make("matrix"))
-        learner.load_state_dict(model["networks"])
-        return model["return"], joint_values(script, args, learner)
+        args = dataclasses.replace(script.parse_args(["--env=wtd-s"]), **shared, **options)
+        values = record_values(script, monkeypatch) if script in VALUES else None
+        greedy = scalars(script.train(args))["eval/return"][-1][1]
+        return greedy / scale, values
 
     return play
 
 
-def joint_values(script, args, learner):
-    """Q of the nine first joint macro-actions, [3, 3], as the script's loss computes it; of Dec-MADDRQN, which has no
-    joint value, the mean of the agents' own values."""
-    env = envs.make("matrix", 9)
-    _, buffer = script.make_learner(args, env)
-    hidden, (obs, infos) = learner["agents"].start(9), env.reset(seed=0)
-    actions, over = np.indices((3, 3)).reshape(2, 9).T, np.zeros(9, bool)
-    while not over.any():  # agent 0 repeats its macro-action, to no effect
-        state = infos["state"]
-        buffer.decide(infos["macro_done"], obs, actions, state, hidden)
-        obs, rewards, over, _, infos = env.step(actions)
-        buffer.reward(rewards, state)
-    buffer.finish(over, over, obs, infos["state"], hidden)
-    batch = buffer.windows(np.arange(9), np.zeros(9, int), 3)
-    with torch.no_grad():
-        values = script.batch_loss(learner, learner, batch, 0.0, 1.0)[1]  # three rows of each episode
-    return values.view(3, 3, 3)[..., 0].numpy()
+def record_values(script, monkeypatch):
+    """Q of the nine first joint macro-actions, [3, 3], which training fills in: what the loss last said of each."""
+    values, td_loss = np.full((3, 3), np.nan), script.td_loss
+
+    def recording(*args):
+        loss, q, target = td_loss(*args)
+        (batch,) = (x for x in args if isinstance(x, dict))
+        valid = batch["valid"]
+        first = (batch["previous"] < 0).all(2) & valid  # rows before which nobody has chosen
+        values[tuple(batch["action"][first].T.numpy())] = q.detach()[first[valid]].numpy()
+        return loss, q, target
+
+    monkeypatch.setattr(script, "td_loss", recording)
+    return values
 
 
 def worst(values, payoff):
@@ -127,8 +127,6 @@ def test_bounds_by_hand():
 
 # ---- what they learn ----------------------------------------------------------------------------------------------
 
-VALUES = [avf_vdn, avf_qmix, avf_qplex, cen_maddrqn]
-
 
 @pytest.mark.parametrize("script", VALUES, ids=lambda s: s.__name__)
 def test_additive_game_is_fitted_by_all(play, script):
@@ -176,4 +174,4 @@ def test_actors_and_critics_find_the_optimum(play, game):
     """On policy: agent 1's a is best as long as agent 0 sometimes takes a, and then so is a for agent 0."""
     settings = dict(total_timesteps=15_000, batch_size=16, exploration_timesteps=10_000, learning_rate=2e-3)
     settings["learning_rate_end"] = None
-    assert play(mac_iaicc, game, reward_scale=0.1, **settings)[0] == 8
+    assert play(mac_iaicc, game, scale=0.1, **settings)[0] == pytest.approx(8)

@@ -181,7 +181,7 @@ def two_by_two(**options):
 
 
 def test_smallest_counterexample_of_literal_qplex():
-    """Q_1 = Q_2 = (1, 0), agent 2 goes on with b: greedy agent 1 takes a, worth -1; b is worth 0."""
+    """Q_1 = Q_2 = (1, 0), agent 2 goes on with b: greedy agent 1 takes a, worth -1; b is worth 0. README opens with it."""
     utilities, situation = [np.array([[1.0, 0.0]])] * 2, ((True, False), (0, 1))
     (q,) = joint_tables(two_by_two(mask_ongoing=False), utilities, situation[0], np.zeros((1, 1)))
     assert np.allclose(q, [[2, -1], [1, 0]], rtol=0, atol=1e-9)
@@ -191,7 +191,7 @@ def test_smallest_counterexample_of_literal_qplex():
     assert not verdict and verdict.action == (0, 1) and verdict.margin == pytest.approx(1)
     assert igm(q, [u[0] for u in utilities])  # nothing is wrong with all agents terminated
     (q,) = joint_tables(two_by_two(), utilities, situation[0], np.zeros((1, 1)))
-    assert np.allclose(q[:, 1], [1, 0], rtol=0, atol=1e-9)  # the same weights, conditioned
+    assert np.allclose(q, [[2, 1], [1, 0]], rtol=0, atol=1e-9)  # the same weights, as shipped
     assert mac_igm(q, [u[0] for u in utilities], *situation)
 
 
