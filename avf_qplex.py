@@ -12,20 +12,15 @@ value, trained on the joint reward (paper: "Value Factorization for Asynchronous
 Numbered deviations from the paper:
  1. Ongoing agents are conditioned on what they can still choose: V_i = Q_i(h_i, m_i), hence A_i = 0. The literal mixer
     (--no-mask-ongoing) breaks Mac-IGM: an ongoing agent's negative advantage is weighted by what the others choose.
- 2. A_i = Q_i - max Q_i (Eq. 4), not a dueling head with advantages of any sign (Def. 3.3): with lambda_i(s, m) free
-    signs break the consistency of greedy choices (theory/README.md).
+ 2. A_i = Q_i - max Q_i (Eq. 4), not a dueling head (Def. 3.3): advantages of any sign break Mac-IGM (theory/README.md).
  3. The mixer's hypernetworks share one hidden layer of the same total width instead of having one each.
- 4. Rewards and values are discounted by gamma^tau between rows. An episode truncated by the horizon bootstraps from its
-    final observation, a terminated one does not.
- 5. Hyperparameters are ours (docs/defaults.md). They include what the paper does not have: Q(lambda) on Box Pushing and
-    Capture Target, hysteretic TD errors on Box Pushing, a falling step size on Capture Target. --td-lambda 0
-    --hysteresis-start 1 is the paper's loss.
+ 4. Discounts are gamma^tau between rows. A truncated episode bootstraps from its final observation.
+ 5. Values are ours (docs/defaults.md), as are Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
 """
 
 import argparse
 import copy
 import json
-import os
 import signal
 import sys
 import time
@@ -43,11 +38,6 @@ from tqdm import tqdm
 import envs
 
 ALGORITHM = Path(__file__).stem
-
-
-def fail(message):
-    """Ends the program with one line."""
-    raise SystemExit(f"{ALGORITHM}: {message}")
 
 
 @dataclass
@@ -72,9 +62,8 @@ class Args:
     batch_size: int = 64  # windows in an update
     window: int = 25  # consecutive rows in a window
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
-    start_e: float = 1.0  # exploration rate at the start
-    end_e: float = 0.05  # exploration rate after exploration_timesteps
-    exploration_timesteps: int = 300_000  # environment steps over which the exploration rate falls linearly
+    end_e: float = 0.05  # exploration rate from exploration_timesteps on
+    exploration_timesteps: int = 300_000  # environment steps over which the exploration rate falls from 1, linearly
     learning_starts: int = 5_000  # environment steps before the first update
     train_frequency: int = 64  # environment steps per gradient update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
@@ -86,20 +75,18 @@ class Args:
     )
     hysteresis_end: float = 1.0  # that factor from exploration_timesteps on, reached linearly
     hidden_size: int = 64  # width of the agents' layers
-    mixing_embed: int = 32  # width of the mixer's hypernetworks
-    # mixer input: joint macro-state, one agent's macro-state, true state at the end of the row's interval or at the row
-    mixer_state: Literal["joint", "single", "real", "decision"] = "joint"
+    mixer_state: Literal["joint", "single", "real", "decision"] = "joint"  # what it sees, see ReplayBuffer.sample
     mask_ongoing: bool = True  # ongoing agents have advantage 0 (deviation 1)
 
     def __post_init__(self):
         if self.env not in envs.IDS:
-            fail(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
-        shares = "learning_rate learning_rate_end gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end"
+            raise SystemExit(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
+        shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis_start hysteresis_end"
         for name, value in vars(self).items():
             low = type(value) is int and name not in ("seed", "learning_starts")
             high = 1 if name in shares.split() else float("inf")
             if type(value) in (int, float) and not low <= value <= high:  # tyro has checked the others' types
-                fail(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
+                raise SystemExit(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
 
 
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
@@ -107,8 +94,8 @@ DEFAULTS = {
     "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
                td_lambda=0.5, hysteresis_start=0.3),
     "ct": dict(total_timesteps=600_000, num_envs=128, learning_rate=1e-3, learning_rate_end=0.0, gamma=0.9,
-               buffer_size=5_000, exploration_timesteps=150_000, train_frequency=256, td_lambda=0.8,
-               obs_scale=4.0, reward_scale=10.0,               hidden_size=32, eval_frequency=40_000, eval_episodes=400),
+               buffer_size=5_000, exploration_timesteps=150_000, train_frequency=256, obs_scale=4.0, reward_scale=10.0,
+               td_lambda=0.8, hidden_size=32, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip
 
 
@@ -126,10 +113,7 @@ class AgentLinear(nn.Module):
 
 
 class Agents(nn.Module):
-    """The agents' utility networks, one each: Linear, ReLU, GRU, Linear, ReLU, Linear.
-
-    n_actions: a list of n ints. obs_size: width d of the padded macro-observation. hidden_size: H.
-    """
+    """The agents' utility networks, one each: Linear, ReLU, GRU, Linear, ReLU, Linear, H = hidden_size wide."""
 
     def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
@@ -140,29 +124,25 @@ class Agents(nn.Module):
         self.gru_hidden = nn.Parameter(torch.empty(n, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
         self.head = AgentLinear(n, hidden_size, hidden_size)
         self.output = AgentLinear(n, hidden_size, widest)
-        self.register_buffer("actions", torch.arange(widest), persistent=False)
-        self.register_buffer("padding", self.actions >= torch.tensor(n_actions)[:, None, None], persistent=False)
+        padding = torch.arange(widest) >= torch.tensor(n_actions)[:, None, None]  # [n, 1, A]
+        self.register_buffer("padding", padding, persistent=False)
 
     def start(self, count):
         """The recurrent states before the first decisions of count episodes: zeros, float32 [n, count, H]."""
         return self.gru_hidden.new_zeros(len(self.gru_hidden), count, self.hidden_size)
 
     def forward(self, obs, previous, hidden, sizes):
-        """Runs sequences packed step by step: sizes[t] entries of step t, those of the longest sequences first.
-
-        obs: float32 [n, M, d], M = sum(sizes). previous: int64 [n, M], the agent's last macro-action, -1 for none.
-        hidden: float32 [n, sizes[0], H], the recurrent states before. sizes: falling list of ints.
-
-        Returns utilities float32 [n, M, A], -inf for macro-actions an agent does not have, and states [n, M, H].
-        """
-        one_hot = previous[..., None] == self.actions  # [n, M, A]
+        """Utilities float32 [n, M, A], -inf for macro-actions an agent does not have, and recurrent states [n, M, H].
+        Sequences are packed step by step: sizes[t] entries of step t, the longest first, M in all. obs: float32
+        [n, M, d]. previous: int64 [n, M], the macro-action before, -1 for none. hidden: float32 [n, sizes[0], H]."""
+        one_hot = previous[..., None] == torch.arange(self.padding.shape[2], device=obs.device)  # [n, M, A]
         gates = self.gru_input(torch.relu(self.encoder(torch.cat([self.obs_scale * obs, one_hot], 2))))  # [n, M, 3 H]
         states = []
         for step in gates.split(sizes, 1):
             hidden = hidden[:, : step.shape[1]]
-            in_gates, in_new = step.tensor_split([2 * self.hidden_size], 2)  # [n, size, 2 H], [n, size, H]
-            h_gates, h_new = torch.bmm(hidden, self.gru_hidden).tensor_split([2 * self.hidden_size], 2)
-            reset, update = torch.sigmoid(in_gates + h_gates).chunk(2, 2)
+            in_reset, in_update, in_new = step.chunk(3, 2)  # [n, size, H] each
+            h_reset, h_update, h_new = torch.bmm(hidden, self.gru_hidden).chunk(3, 2)
+            reset, update = torch.sigmoid(in_reset + h_reset), torch.sigmoid(in_update + h_update)
             hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
             states.append(hidden)
         states = torch.cat(states, 1)  # [n, M, H]
@@ -171,61 +151,47 @@ class Agents(nn.Module):
 
 def over_rows(batch, *networks):
     """Utilities float32 [B, T, n, A] of each network at the rows of a batch.
-
-    A macro-history moves only where its agent chooses, so the networks run over each agent's own decisions, a fraction
-    of the rows: packed as Agents.forward wants them, and unpacked to the rows, which look up the latest decision.
-    """
-    own = batch["chosen"].movedim(2, 0).clone()  # [n, B, T]
-    own[..., 0] = True  # a window starts with what every agent saw last
-    count = own.cumsum(2)  # [n, B, T], decisions up to the row
-    length, agents = count[..., -1], torch.arange(len(own), device=own.device)[:, None, None]  # [n, B], [n, 1, 1]
-    rank = length.argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # [n, B]
-    sizes = (length[..., None] > torch.arange(own.shape[2], device=own.device)).sum(1).amax(0)  # [T]
-    entry = (sizes.cumsum(0) - sizes)[count - 1] + rank[..., None]  # [n, B, T], where the latest decision is packed
-    obs = batch["obs"].new_zeros(len(own), int(sizes.sum()), batch["obs"].shape[3])  # [n, M, d]
+    A macro-history moves only where its agent chooses: networks run over every agent's own decisions, a fraction of the
+    rows. They are packed as Agents.forward wants them, and rows look up the latest one."""
+    chosen = batch["chosen"].movedim(2, 0)  # [n, B, T]
+    step = chosen.cumsum(2) - chosen[..., :1].int()  # [n, B, T], a window begins with what its agents saw last
+    length = step[..., -1:]  # [n, B, 1]
+    rank = length.argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # [n, B, 1]
+    sizes = (length >= torch.arange(step.shape[2], device=step.device)).sum(1).amax(0)  # [T]
+    entry = (sizes.cumsum(0) - sizes)[step] + rank  # [n, B, T], where the latest decision is packed
+    agents = torch.arange(len(step), device=step.device)[:, None, None]
+    obs = batch["obs"].new_zeros(len(step), int(sizes.sum()), batch["obs"].shape[3])  # [n, M, d]
     previous = batch["previous"].new_zeros(obs.shape[:2])  # [n, M]
-    # rows with the same latest decision write the same, what the agent saw and did before it
-    obs[agents, entry], previous[agents, entry] = batch["obs"].movedim(2, 0), batch["previous"].movedim(2, 0)
+    obs[agents, entry] = batch["obs"].movedim(2, 0)  # rows with the same latest decision write the same
+    previous[agents, entry] = batch["previous"].movedim(2, 0)
     sizes = sizes[sizes > 0].tolist()
-    packed = (network(obs, previous, network.start(sizes[0]), sizes)[0] for network in networks)
-    return [utilities[agents, entry].movedim(0, 2) for utilities in packed]
+    return [net(obs, previous, net.start(sizes[0]), sizes)[0][agents, entry].movedim(0, 2) for net in networks]
 
 
 class QPLEXMixer(nn.Module):
-    """Duplex dueling (Wang et al. 2021) for agents some of which are ongoing.
-
-    Transformed: Q_i <- w_i(s) Q_i + b_i(s), V_i <- w_i(s) V_i + b_i(s), w_i > 0, and A_i = Q_i - V_i. Then
-    Q(h, s, m) = sum_i Q_i + sum_i (lambda_i - 1) stopgrad(A_i), which equals sum_i V_i + lambda_i A_i, with
-    lambda_i = sum over heads of |key(s)| sigmoid(agent_i(s)) sigmoid(action_i(s, m)) >= 0.
-
-    n_actions: a list of n ints. state_size: width of the mixer input. mask_ongoing: A_i = 0 for ongoing agents.
-    """
+    """Duplex dueling (Wang et al. 2021): sum_i V_i + lambda_i A_i = sum_i Q_i + (lambda_i - 1) A_i, A_i = Q_i - V_i.
+    Q_i and V_i are first transformed: w_i(s) Q_i + b_i(s), w_i > 0. lambda_i = sum over heads of |key(s)|
+    sigmoid(agent_i(s)) sigmoid(action_i(s, m)) >= 0. mask_ongoing: ongoing agents have A_i = 0 (deviation 1)."""
 
     def __init__(self, n_actions, state_size, embed=32, heads=4, mask_ongoing=True):
         super().__init__()
-        n, widest = len(n_actions), max(n_actions)
+        n, self.widest = len(n_actions), max(n_actions)
         self.heads, self.mask_ongoing = heads, mask_ongoing
-
-        def hypernetwork(inputs, outputs):
-            return nn.Sequential(nn.Linear(inputs, heads * embed), nn.ReLU(True), nn.Linear(heads * embed, outputs))
-
-        self.of_state = hypernetwork(state_size, 2 * n + heads + heads * n)
-        self.of_action = hypernetwork(state_size + n * widest, heads * n)
-        self.register_buffer("actions", torch.arange(widest), persistent=False)
+        inputs, hidden = state_size + n * self.widest, heads * embed
+        outputs = 2 * n + heads + heads * n
+        self.of_state = nn.Sequential(nn.Linear(state_size, hidden), nn.ReLU(True), nn.Linear(hidden, outputs))
+        self.of_action = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(True), nn.Linear(hidden, heads * n))
 
     def forward(self, utilities, values, actions, chosen, state):
-        """The joint value, float32 [...].
-
-        utilities, values: Q_i(h_i, m_i) and V_i(h_i), float32 [..., n]. actions: m, int64 [..., n].
-        chosen: bool [..., n], False for ongoing agents. state: float32 [..., S].
-        """
+        """The joint value, float32 [...], of Q_i(h_i, m_i) and V_i(h_i), float32 [..., n], m, int64 [..., n], who chose
+        it, bool [..., n], False for ongoing agents, and the state, float32 [..., S]."""
         n = utilities.shape[-1]
         if self.mask_ongoing:  # an ongoing agent can only go on: its value is that of its macro-action
             values = torch.where(chosen, values, utilities)
         weight, bias, key, agent = self.of_state(state).split([n, n, self.heads, self.heads * n], -1)
         weight = weight.abs() + 1e-10  # positive: the transform keeps each agent's order of macro-actions
-        advantages = (weight * (utilities - values)).detach()
-        one_hot = (actions[..., None] == self.actions).flatten(-2)  # [..., n * A]
+        advantages = (weight * (utilities - values)).detach()  # teaches lambda_i, not the utilities
+        one_hot = nn.functional.one_hot(actions, self.widest).flatten(-2)  # [..., n * A]
         action = self.of_action(torch.cat([state, one_hot], -1))
         agent, action = (torch.sigmoid(x.unflatten(-1, (self.heads, n))) for x in (agent, action))  # [..., heads, n]
         lambdas = (key.abs()[..., None] * agent * action).sum(-2)  # [..., n], not negative: no gain by being worse
@@ -234,10 +200,7 @@ class QPLEXMixer(nn.Module):
 
 class ReplayBuffer:
     """Whole episodes of rows (Fig. 2), one array [capacity + N, horizon + 1, ...] for each field of a row.
-
-    An agent's macro-state is the state of the row since which it runs its macro-action. `writing` are the episodes that
-    run in the environments, `queue` the ended ones (and free places, of no rows), the oldest first.
-    """
+    writing: the N episodes that run in the environments. queue: ended ones, the oldest first, after free places."""
 
     def __init__(self, env, capacity):
         (n, d), state = env.single_observation_space.shape, (env.state_size,)
@@ -264,39 +227,37 @@ class ReplayBuffer:
         self.reward[at], self.discount[at] = 0.0, 1.0
         self.rows[episode] += 1
 
-    def step(self, rewards, discounts, state):
-        """Adds a step to the running rows: r += gamma^t r_t. float64 [N] (0 at a terminal step), state before it."""
+    def step(self, state, rewards, discounts, over, obs, infos):
+        """Adds a step from a state to the running rows, r += gamma^t r_t, and ends the episodes in over, bool [N], with
+        a row for their final observation. rewards, discounts: float64 [N], the latter gamma, 0 at a terminal step."""
         at = self.writing, self.rows[self.writing] - 1
         self.reward[at] += self.discount[at] * rewards
         self.discount[at] *= discounts
         self.real[at] = state
-
-    def finish(self, over, obs, infos):
-        """Ends the episodes in over, bool [N], with a row for their final observation."""
         self.add(obs, infos["macro_action"], infos["macro_done"] & over[:, None], infos["state"])
-        queue = np.append(self.queue, self.writing[over])
-        self.writing[over], self.queue = np.split(queue, [over.sum()])
+        self.writing[over], self.queue = np.split(np.append(self.queue, self.writing[over]), [over.sum()])
         self.rows[self.writing[over]] = 0
 
     def sample(self, batch_size, window, mixer_state, rng, device="cpu"):
-        """Windows of random episodes, in which every row is as likely as any other: a dict of tensors [B, T, ...].
-
-        T = window + 1: `valid` marks the rows that have a next one, at which the target looks. Windows reach over both
-        ends of an episode and are cut there: had all to fit in, the last row, often the one with the reward, were rare.
-        """
+        """Windows of random episodes as tensors [B, T, ...] by name. T = window + 1, `valid` marks rows with a next one.
+        Every row is as likely as any other: windows reach over both ends of an episode and are cut there. mixer_state:
+        "joint", of the rows since which agents run their macro-actions (macro-states); "single", that of one whose
+        macro-action ends with the row's interval; "real", of the interval's last step; "decision", of the row."""
         ended = self.queue[self.rows[self.queue] > 0]
         episode = ended[rng.integers(len(ended), size=(batch_size, 1))]
         last = self.rows[episode] - 1  # [B, 1], the row of the final observation
         start = rng.integers(1 - window, last)
-        end, row = np.minimum(start + window, last), np.maximum(start, 0) + np.arange(window + 1)  # [B, 1], [B, T]
-        at, episodes = (episode, np.minimum(row, end)), episode[..., None]
-        since, agents = self.since[at], np.arange(self.since.shape[2])  # [B, T, n], [n]
+        end = np.minimum(start + window, last)
+        row = np.maximum(start, 0) + np.arange(window + 1)  # [B, T]
+        at = episode, np.minimum(row, end)
+        since = self.since[at]  # [B, T, n]
+        before = episode[..., None], since - 1, np.arange(since.shape[2])
         batch = {key: getattr(self, key)[at] for key in ("obs", "action", "state", "reward", "discount")}
-        previous = np.where(since > 0, self.action[episodes, since - 1, agents], -1)  # [B, T, n]
+        previous = np.where(since > 0, self.action[before], -1)  # [B, T, n]
         batch |= dict(valid=row < end, chosen=since == row[..., None], previous=previous, next_state=batch["state"])
         if mixer_state == "joint":
-            batch["state"] = batch["next_state"] = self.state[episodes, since].reshape(*row.shape, -1)
-        elif mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
+            batch["state"] = batch["next_state"] = self.state[episode[..., None], since].reshape(*row.shape, -1)
+        elif mixer_state == "single":
             agent = np.roll(batch["chosen"], -1, 1).argmax(2)[..., None]  # [B, T, 1]
             batch["state"] = self.state[episode, np.take_along_axis(since, agent, 2)[..., 0]]
         elif mixer_state == "real":
@@ -305,25 +266,20 @@ class ReplayBuffer:
 
 
 def td_loss(utilities, target_utilities, mixer, target_mixer, batch, td_lambda=0.0, hysteresis=1.0):
-    """The loss of Eq. 14 over the R valid rows of a batch, with double Q-learning.
-
-    utilities, target_utilities: float32 [B, T, n, A], of the online and the target networks at the batch's rows.
-    mixer, target_mixer: callables (utilities, values, actions, chosen, state) -> joint values [R].
-    td_lambda: 0 for one-row targets, up to 1. hysteresis: factor on negative TD errors, 1 for none.
-
-    Returns the loss (scalar tensor), joint values and targets, float32 [R] each.
-    """
+    """The loss of Eq. 14, with double Q-learning; joint values and targets float32 [R] of the R valid rows of a batch.
+    utilities, target_utilities: float32 [B, T, n, A]. mixer, target_mixer: (utilities, values, actions, chosen, state)
+    -> joint values. td_lambda: 0 for one-row targets, up to 1. hysteresis: factor on negative TD errors, 1 for none."""
     here = batch["valid"]  # [B, T], rows that have a next one
     there = here.roll(1, 1)  # [B, T], the rows after them: a window's last row has none
     chosen, action = batch["chosen"], batch["action"]  # [B, T, n]
     taken = utilities.gather(3, action[..., None])[..., 0]  # [B, T, n]
     q = mixer(*(x[here] for x in (taken, utilities.amax(3), action, chosen, batch["state"])))  # [R]
-
     with torch.no_grad():
         # The conditional argmax: agents that choose take the online network's best, the others go on.
         best = torch.where(chosen, utilities.argmax(3), action)  # [B, T, n]
-        best_q, best_v = target_utilities.gather(3, best[..., None])[..., 0], target_utilities.amax(3)  # [B, T, n]
-        bootstrap = target_mixer(*(x[there] for x in (best_q, best_v, best, chosen, batch["next_state"])))  # [R]
+        best_q = target_utilities.gather(3, best[..., None])[..., 0]  # [B, T, n]
+        inputs = (best_q, target_utilities.amax(3), best, chosen, batch["next_state"])
+        bootstrap = target_mixer(*(x[there] for x in inputs))  # [R]
         target = batch["reward"][here] + batch["discount"][here] * bootstrap  # [R]
         if td_lambda > 0:  # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
             returns, later = torch.zeros(2, *here.shape, device=q.device)  # [B, T] each
@@ -337,13 +293,8 @@ def td_loss(utilities, target_utilities, mixer, target_mixer, batch, td_lambda=0
 
 
 def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
-    """Epsilon-greedy macro-actions of the free agents.
-
-    obs: float32 [N, n, d] and infos of the environment's last reset or step. hidden: float32 [n, N, H].
-    epsilon: exploration rate. rng: NumPy generator, needed if epsilon > 0.
-
-    Returns actions int64 [N, n] (of ongoing agents the running one), recurrent states that moved where an agent is free.
-    """
+    """Epsilon-greedy macro-actions int64 [N, n] and recurrent states float32 [n, N, H], moved where agents are free.
+    obs, float32 [N, n, d], and infos are those of the environment's last reset or step."""
     free, running = infos["macro_done"], infos["macro_action"]
     by_agent = [torch.from_numpy(x).to(hidden.device).transpose(0, 1) for x in (obs, running, free)]  # [n, N, ...]
     with torch.no_grad():
@@ -356,36 +307,27 @@ def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
 
 
 def evaluate(agents, env, gamma, seed):
-    """Greedy play: the first episode of each environment of a batch, reset with the seed.
-
-    Returns a dict of float64 [N]: return, discounted_return, length, success (0 or 1).
-    """
+    """Greedy play: return, discounted_return, length, success of each environment's first episode, float64 [N] each."""
     obs, infos = env.reset(seed=seed)
     hidden, live, step, result = agents.start(env.num_envs), np.ones(env.num_envs, bool), 0, {}
     while live.any():
         actions, hidden = act(agents, obs, infos, hidden)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        gains = {
-            "return": rewards,
-            "discounted_return": gamma**step * rewards,
-            "length": 1,
-            "success": infos["success"],
-        }
-        result = {key: result.get(key, 0.0) + live * gain for key, gain in gains.items()}
-        over, step = terminations | truncations, step + 1
+        new = {"return": rewards, "discounted_return": gamma**step * rewards, "length": 1, "success": infos["success"]}
+        result = {key: result.get(key, 0.0) + live * value for key, value in new.items()}
+        over = terminations | truncations
         live &= ~over
-        if over.any():  # play on in ended environments without looking
-            obs, infos = env.reset(options={"reset_mask": over})
-            hidden[:, over] = 0.0
+        step += 1
+        obs, infos = env.reset(options={"reset_mask": over})  # play on in ended environments without looking
+        hidden[:, over] = 0.0
     return result
 
 
 def make_learner(args, env):
     """Agents and mixer as one module on the device."""
-    sizes = env.single_observation_space.shape[1], args.hidden_size, args.obs_scale
-    agents = Agents(env.n_actions, *sizes)
+    agents = Agents(env.n_actions, env.single_observation_space.shape[1], args.hidden_size, args.obs_scale)
     width = env.state_size * (env.n_agents if args.mixer_state == "joint" else 1)
-    mixer = QPLEXMixer(env.n_actions, width, args.mixing_embed, mask_ongoing=args.mask_ongoing)
+    mixer = QPLEXMixer(env.n_actions, width, mask_ongoing=args.mask_ongoing)
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device)
 
 
@@ -399,8 +341,7 @@ def train(args, stop=()):
     target, agents = copy.deepcopy(learner).requires_grad_(False), learner["agents"]
     fast, slow = list(learner.parameters()), list(target.parameters())
     optimizer = torch.optim.Adam(fast, lr=args.learning_rate, fused=True)
-    average = torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)
-    networks, buffer = (learner, target, optimizer), ReplayBuffer(env, args.buffer_size)
+    buffer = ReplayBuffer(env, args.buffer_size)
     obs, infos = env.reset(seed=args.seed)
     hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
     folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
@@ -410,7 +351,7 @@ def train(args, stop=()):
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
     if args.resume:
         saved = load(folder / "checkpoint.pt")
-        for part, state in zip(networks, saved["networks"], strict=True):
+        for part, state in zip((learner, target, optimizer), saved["parts"], strict=True):
             part.load_state_dict(state)
         vars(buffer).update({key: value.numpy() for key, value in saved["buffer"].items()})
         obs, infos = env.load_state(saved["env"])
@@ -419,11 +360,9 @@ def train(args, stop=()):
     else:
         folder.mkdir(parents=True)
         (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
-        os.replace(folder / "args.json.new", folder / "args.json")
-    writer, bar = (
-        SummaryWriter(folder, purge_step=step + 1),
-        tqdm(total=args.total_timesteps, initial=step, disable=None),
-    )
+        (folder / "args.json.new").replace(folder / "args.json")
+    writer = SummaryWriter(folder, purge_step=step + 1)
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
     started, first_step, saved_at = time.time(), step, time.time()
 
     def log(group, **values):
@@ -433,21 +372,18 @@ def train(args, stop=()):
     while step < args.total_timesteps and not stop:
         # Choose and step
         progress, done = min(1.0, step / args.exploration_timesteps), step / args.total_timesteps
-        epsilon = args.start_e + progress * (args.end_e - args.start_e)
+        epsilon = 1.0 + progress * (args.end_e - 1.0)
         if args.learning_rate_end is not None:
             optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.add(obs, actions, infos["macro_done"], state)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        buffer.step(args.reward_scale * rewards, np.float32(args.gamma) * ~terminations, state)
+        over, discounts = terminations | truncations, np.float32(args.gamma) * ~terminations
+        buffer.step(state, args.reward_scale * rewards, discounts, over, obs, infos)
         step += args.num_envs
         bar.update(args.num_envs)
-
-        # Store the episodes that ended and start new ones
-        over = terminations | truncations
         if over.any():
-            buffer.finish(over, obs, infos)
             recent += env.episode_return[over].tolist()
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
@@ -462,7 +398,7 @@ def train(args, stop=()):
             loss.backward()
             grad_norm = nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
             optimizer.step()
-            average(slow, fast, None)
+            torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)(slow, fast, None)
             updates += 1
             if updates % 100 == 0:
                 log("losses", td_loss=loss, q_values=joint_q.mean(), grad_norm=grad_norm)
@@ -485,9 +421,11 @@ def train(args, stop=()):
         if time.time() - saved_at > args.checkpoint_frequency or stop:
             writer.flush()  # what was logged up to here is not logged again after a resume
             arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
-            save(folder / "checkpoint.pt", args, networks=[part.state_dict() for part in networks], hidden=hidden,
-                 buffer={key: torch.from_numpy(value) for key, value in vars(buffer).items()}, env=arrays,
-                 rng=rng.bit_generator.state, progress=(step, updates, recent, best))  # fmt: skip
+            parts = [part.state_dict() for part in (learner, target, optimizer)]
+            memory = {key: torch.from_numpy(value) for key, value in vars(buffer).items()}
+            progress = step, updates, recent, best
+            save(folder / "checkpoint.pt", args, parts=parts, buffer=memory, env=arrays, hidden=hidden,
+                 rng=rng.bit_generator.state, progress=progress)  # fmt: skip
             saved_at = time.time()
 
     bar.close()
@@ -500,7 +438,7 @@ def train(args, stop=()):
 def save(path, args, **content):
     """Writes beside the file and swaps, so that a kill at any moment leaves the old one or the new one."""
     torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, f"{path}.new")
-    os.replace(f"{path}.new", path)
+    Path(f"{path}.new").replace(path)
 
 
 def load(path):
@@ -508,10 +446,10 @@ def load(path):
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
         if saved["algorithm"] != ALGORITHM:
-            fail(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
+            raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
         return saved
     except Exception as error:  # torch names no common class for what a damaged file raises
-        fail(f"cannot read {path}: {str(error).splitlines()[0]}")
+        raise SystemExit(f"cannot read {path}: {str(error).splitlines()[0]}") from None
 
 
 def parse_args(argv=None):
@@ -520,15 +458,14 @@ def parse_args(argv=None):
     peek.add_argument("--env")
     peek.add_argument("--resume")
     known, others = peek.parse_known_args(argv)
+    if known.resume and (known.env or others):
+        raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
     if known.resume:
-        if known.env or others:
-            fail("--resume goes on with the run's own settings: no other flag can be given with it")
-        args = Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
-    else:
-        env = known.env or Args.env
-        args = tyro.cli(Args, default=Args(env=env, **DEFAULTS.get(env.split("-")[0], {})), args=argv)
+        return Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
+    env = known.env or Args.env
+    args = tyro.cli(Args, default=Args(env=env, **DEFAULTS.get(env.split("-")[0], {})), args=argv)
     if args.device == "cuda" and not torch.cuda.is_available():
-        fail("--device cuda: there is none")
+        raise SystemExit("--device cuda: there is none")
     return args
 
 
@@ -539,7 +476,7 @@ if __name__ == "__main__":
     try:
         print(folder := train(parse_args(), stop))
     except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
-        fail(error)
+        raise SystemExit(error) from None
     if (folder / "checkpoint.pt").exists():
         print(f"stopped; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
         sys.exit(128 + stop[0])
