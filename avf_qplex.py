@@ -239,7 +239,7 @@ class ReplayBuffer:
         self.rows[self.writing[over]] = 0
 
     def sample(self, batch_size, window, mixer_state, rng, device="cpu"):
-        """Windows of random episodes as tensors [B, T, ...] by name. T = window + 1, `valid` marks rows with a next one.
+        """Windows of random episodes: tensors [B, T, ...] by name. T = window + 1, `valid` marks rows with a next one.
         Every row is as likely as any other: windows reach over both ends of an episode and are cut there. mixer_state:
         "joint", of the rows since which agents run their macro-actions (macro-states); "single", that of one whose
         macro-action ends with the row's interval; "real", of the interval's last step; "decision", of the row."""
