@@ -4,7 +4,7 @@ The actor-critic baseline of Xiao et al. (2022, "Asynchronous actor-critic for m
 policy. Actors see their own macro-histories and are all that is needed to act; critics see the joint one and are needed
 for learning only.
 
-    critic of agent i     V_i(joint macro-history): a recurrent network that moves at every decision row
+    critic of agent i     V_i(joint macro-history): a recurrent network that moves at every row
     boundaries of i       the rows where agent i chooses: its critic is trained and its policy improved only there
     n-step return         G_i = r_i + gamma^tau_i r'_i + ... + gamma^(tau_i + tau'_i + ...) V'_i, over n of its own
                           macro-actions, r_i being the joint reward summed over each
@@ -19,117 +19,80 @@ Numbered deviations from the published baseline:
  3. Target critics follow slowly (Polyak) at every update instead of being copied now and then.
  4. One Adam step is taken for actors and critics together, their losses being sums over agents of means over decisions.
  5. Evaluation is greedy: the most likely macro-action.
- 6. Hyperparameters are ours, see docs/defaults.md.
+ 6. Values are ours, as are scaled inputs and rewards and a falling step size (docs/defaults.md).
 """
 
-# >>> imports, identical to avf_vdn.py
 import argparse
 import copy
-import importlib.util
 import json
-import os
 import signal
 import sys
 import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
 import tyro
-from PIL import Image
 from torch import nn
-from torch.nn import functional as F
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import envs
 
 ALGORITHM = Path(__file__).stem
-# <<< imports
 
 
 @dataclass
 class Args:
-    # >>> run arguments, identical to avf_vdn.py
-    env: str = "wtd-s"
-    """task, one of envs.IDS"""
-    seed: int = 1
-    """seed of networks, exploration, replay and environments, from 0 on"""
-    total_timesteps: int = 400_000
-    """environment steps of the run, over all environments"""
-    num_envs: int = 32
-    """environments stepped side by side"""
-    eval_frequency: int = 10_000
-    """environment steps between greedy evaluations"""
-    eval_episodes: int = 20
-    """episodes of an evaluation, freshly seeded each time"""
-    checkpoint_frequency: int = 100_000
-    """environment steps between checkpoints, from which --resume continues exactly"""
-    runs_dir: str = "runs"
-    """folder in which each run makes its own"""
-    device: str = "cpu"
-    """torch device, cpu or cuda"""
-    torch_threads: int = 1
-    """CPU threads of torch; one is fastest for networks of this size"""
-    resume: str | None = None
-    """run folder to continue from its checkpoint, with its own settings"""
-    evaluate: str | None = None
-    """run folder whose model is evaluated, without training"""
-    model: Literal["best", "last"] = "best"
-    """with --evaluate: the model of the best greedy evaluation or of the last one"""
-    gif: str | None = None
-    """with --evaluate: file for an animation of one episode"""
-    track: bool = False
-    """log to Weights & Biases too, which needs the extra `track`; with WANDB_MODE=offline no account"""
-    wandb_project_name: str = "avf"
-    """with --track: the project there"""
-    wandb_entity: str | None = None
-    """with --track: the team there"""
-    # <<< run arguments
+    env: str = "wtd-s"  # task, one of envs.IDS
+    seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
+    total_timesteps: int = 400_000  # environment steps of the run, over all environments
+    num_envs: int = 32  # environments stepped side by side
+    eval_frequency: int = 10_000  # environment steps between greedy evaluations
+    eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
+    checkpoint_frequency: float = 60.0  # seconds between checkpoints, from which --resume continues exactly
+    runs_dir: str = "runs"  # folder in which each run makes its own
+    resume: str | None = None  # run folder of an interrupted run to go on with, with its own settings
+    device: Literal["cpu", "cuda"] = "cpu"  # where networks learn and act
+    track: bool = False  # log to Weights & Biases too, which takes project and entity from its environment variables
 
     # Algorithm
-    learning_rate: float = 1e-3
-    """Adam's step size"""
-    learning_rate_end: float | None = 0.0
-    """step size at total_timesteps, reached linearly; None keeps it constant"""
-    gamma: float = 0.99
-    """discount per environment step, in [0, 1]"""
-    batch_size: int = 8
-    """episodes that end before an update is made on them"""
-    n_step: int = 5
-    """macro-actions of an agent in its return before its target critic takes over"""
-    polyak: float = 0.95
-    """share of the target critics kept at each update; higher is slower"""
-    start_e: float = 0.5
-    """share of uniform macro-actions in the policies at the start"""
-    end_e: float = 0.01
-    """that share after exploration_timesteps"""
-    exploration_timesteps: int = 200_000
-    """environment steps over which the share falls linearly"""
-    entropy_coef: float = 0.01
-    """weight of the policies' entropy in the loss; bigger explores longer"""
-    max_grad_norm: float = 10.0
-    """the gradient is scaled down to this norm"""
-    reward_scale: float = 0.01
-    """factor on rewards inside the loss; logged returns are unscaled"""
-    obs_scale: float = 1.0
-    """factor on macro-observations where they enter a network; more resolves small differences"""
-    hidden_size: int = 64
-    """width of the actors' and critics' layers"""
+    learning_rate: float = 1e-3  # Adam's step size
+    learning_rate_end: float | None = 0.0  # step size at total_timesteps, reached linearly; None keeps it constant
+    gamma: float = 0.99  # discount per environment step, in [0, 1]
+    batch_size: int = 8  # episodes that end before an update is made on them
+    n_step: int = 5  # macro-actions of an agent in its return before its target critic takes over
+    polyak: float = 0.95  # share of the target critics kept at each update; higher is slower
+    start_e: float = 0.5  # share of uniform macro-actions in the policies at the start
+    end_e: float = 0.01  # that share from exploration_timesteps on
+    exploration_timesteps: int = 200_000  # environment steps over which the share falls linearly
+    entropy_coef: float = 0.01  # weight of the policies' entropy in the loss; bigger explores longer
+    max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
+    obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
+    reward_scale: float = 0.01  # factor on rewards inside the loss; logged returns are unscaled
+    hidden_size: int = 64  # width of the actors' and critics' layers
+
+    def __post_init__(self):
+        if self.env not in envs.IDS:
+            raise SystemExit(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
+        shares = "learning_rate learning_rate_end gamma polyak start_e end_e"
+        for name, value in vars(self).items():
+            low = type(value) is int and name != "seed"
+            high = 1 if name in shares.split() else float("inf")
+            if type(value) in (int, float) and not low <= value <= high:  # tyro has checked the others' types
+                raise SystemExit(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
 
 
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "wtd": dict(total_timesteps=400_000, exploration_timesteps=200_000),
     "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000, gamma=0.95),
     "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, batch_size=32,
-               reward_scale=1.0, obs_scale=4.0, eval_frequency=40_000, eval_episodes=400),
+               obs_scale=4.0, reward_scale=1.0, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip
 
 
-# >>> agents, identical to avf_vdn.py
 class AgentLinear(nn.Module):
     """A linear layer for each agent, as one batched product: [n, M, inputs] -> [n, M, outputs]."""
 
@@ -144,694 +107,355 @@ class AgentLinear(nn.Module):
 
 
 class Agents(nn.Module):
-    """The agents' utility networks, one each: Linear, ReLU, GRU, Linear, ReLU, Linear.
-
-    n_actions: a list of n ints. obs_size: width d of the padded macro-observation, which is multiplied by obs_scale.
-    """
+    """A network for each agent, H = hidden_size wide: Linear, ReLU, GRU, Linear, ReLU, Linear, logits or one value."""
 
     def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
-        self.obs_scale = obs_scale
         n, widest, bound = len(n_actions), max(n_actions), hidden_size**-0.5
-        self.n_actions, self.hidden_size = np.array(n_actions), hidden_size
+        self.n_actions, self.hidden_size, self.obs_scale = np.array(n_actions), hidden_size, obs_scale
         self.encoder = AgentLinear(n, obs_size + widest, hidden_size)
         self.gru_input = AgentLinear(n, hidden_size, 3 * hidden_size)
         self.gru_hidden = nn.Parameter(torch.empty(n, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
         self.head = AgentLinear(n, hidden_size, hidden_size)
         self.output = AgentLinear(n, hidden_size, widest)
-        self.register_buffer("actions", torch.arange(widest), persistent=False)
-        self.register_buffer("padding", self.actions >= torch.tensor(n_actions)[:, None, None], persistent=False)
+        padding = torch.arange(widest) >= torch.tensor(n_actions)[:, None, None]  # [n, 1, A]
+        self.register_buffer("padding", padding, persistent=False)
 
     def start(self, count):
         """The recurrent states before the first decisions of count episodes: zeros, float32 [n, count, H]."""
         return self.gru_hidden.new_zeros(len(self.gru_hidden), count, self.hidden_size)
 
-    def inputs(self, obs, previous):
-        """Macro-observations and the one-hot macro-actions before them: [n, M, d + A]."""
-        return torch.cat([self.obs_scale * obs, (previous[..., None] == self.actions).float()], 2)
-
     def forward(self, obs, previous, hidden, sizes):
-        """Runs sequences packed step by step: sizes[t] entries of step t, those of the longest sequences first.
-
-        Args:
-            obs: float32 [n, M, d], M = sum(sizes). previous: int64 [n, M], the agent's last macro-action, -1 for none.
-            hidden: float32 [n, sizes[0], H], recurrent state before, or None for zeros. sizes: falling list of ints.
-
-        Returns:
-            utilities float32 [n, M, A] (-inf for padding actions), values V_i float32 [n, M], states float32 [n, M, H].
-        """
-        gates = self.gru_input(F.relu(self.encoder(self.inputs(obs, previous))))  # [agents, M, 3 hidden]
-        if hidden is None:
-            hidden = self.start(sizes[0])
+        """Logits float32 [n, M, A], -inf for macro-actions an agent does not have, and recurrent states [n, M, H].
+        Sequences are packed step by step: sizes[t] entries of step t, the longest first, M in all. obs: float32
+        [n, M, d]. previous: int64 [n, M], the macro-action before, -1 for none. hidden: float32 [n, sizes[0], H]."""
+        one_hot = previous[..., None] == torch.arange(self.padding.shape[2], device=obs.device)  # [n, M, A]
+        gates = self.gru_input(torch.relu(self.encoder(torch.cat([self.obs_scale * obs, one_hot], 2))))  # [n, M, 3 H]
         states = []
         for step in gates.split(sizes, 1):
             hidden = hidden[:, : step.shape[1]]
-            in_reset, in_update, in_new = step.chunk(3, 2)  # [agents, size, hidden] each
+            in_reset, in_update, in_new = step.chunk(3, 2)  # [n, size, H] each
             h_reset, h_update, h_new = torch.bmm(hidden, self.gru_hidden).chunk(3, 2)
             reset, update = torch.sigmoid(in_reset + h_reset), torch.sigmoid(in_update + h_update)
             hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
             states.append(hidden)
-        states = torch.cat(states, 1)  # [agents, M, hidden]
-        utilities = self.output(F.relu(self.head(states)))  # [agents, M, actions]
-        utilities = utilities.masked_fill(self.padding, -torch.inf)
-        return utilities, utilities.amax(2), states
+        states = torch.cat(states, 1)  # [n, M, H]
+        return self.output(torch.relu(self.head(states))).masked_fill(self.padding, -torch.inf), states
 
 
-# <<< agents
-
-
-class Critics(Agents):
-    """The agents' critics: n recurrent networks over the same joint macro-history, with one value each.
-
-    n_actions: macro-actions of each agent. obs_size: width d of a padded macro-observation.
-    """
-
-    def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
-        n, widest = len(n_actions), max(n_actions)
-        super().__init__([1] * n, 0, hidden_size, obs_scale)
-        self.encoder = AgentLinear(n, n * (obs_size + 1 + widest), hidden_size)
-        self.register_buffer("choices", torch.arange(widest), persistent=False)
-
-    def inputs(self, obs, previous):
-        """Joint macro-observations, which have the macro-actions before in them already."""
-        return self.obs_scale * obs
-
-    def values(self, joint):
-        """V_i, float32 [n, T], at the T entries of a JointHistory."""
-        before = joint.before[..., None] == self.choices  # [T, agents, actions]
-        obs = torch.cat([joint.obs, joint.free[..., None], before], 2).flatten(1)  # [T, agents * (d + 1 + actions)]
-        return self(obs.expand(len(self.gru_hidden), -1, -1), None, None, joint.sizes)[1]
-
-
-# >>> replay, identical to avf_vdn.py
-class Batch(NamedTuple):
-    """A batch of B windows of up to W decision rows: R rows in all, n agents.
-
-    The agents' own decisions, M entries, are packed as Agents.forward wants them; a row looks up its agents' by entry.
-    """
-
-    obs: torch.Tensor  # float32 [n, M, d]
-    previous: torch.Tensor  # int64 [n, M], the macro-action before, -1 for none
-    action: torch.Tensor  # int64 [n, M], the macro-action chosen there (0 in padding and at an episode's end)
-    hidden: torch.Tensor | None  # float32 [n, B, H], None for zeros
-    sizes: list  # entries of each step
-    entry: torch.Tensor  # int64 [R, n], the latest decision of each agent at the row
-    next_entry: torch.Tensor  # int64 [R, n], and at the row after it
-    chosen: torch.Tensor  # bool [R, n], False for agents that are ongoing at the row
-    next_chosen: torch.Tensor  # bool [R, n]
-    state: torch.Tensor  # float32 [R, S], mixer input of the row
-    next_state: torch.Tensor  # float32 [R, S], and of its target
-    reward: torch.Tensor  # float32 [R], discounted sum until the next row
-    discount: torch.Tensor  # float32 [R], gamma^tau, 0 where the episode terminated
-    valid: torch.Tensor  # bool [B, W], where the R rows stand in their windows
-
-    def by_window(self, x):
-        """Values of the rows, [R, ...], as [W, B, ...], zero where a window has no row."""
-        padded = x.new_zeros(*self.valid.shape, *x.shape[1:])  # [B, W, ...]
-        padded[self.valid] = x
-        return padded.transpose(0, 1)
-
-
-class ReplayBuffer:
-    """Whole episodes as arrays: each agent's own decisions, and joint decision rows that point at them.
-
-    A macro-history moves only when its agent chooses, so macro-observations and macro-actions are stored once per
-    decision. Row k holds the number of each agent's latest decision; `row` of that decision is the row whose state is
-    the agent's macro-state. Episodes are collected in `current`, one per environment, and copied to `data` when they
-    end: a window cannot reach into another episode.
-
-    capacity: episodes kept. hidden_size: width of the recurrent states stored with the decisions, 0 for none.
-    state_scale: factor on the states of a batch.
-    """
-
-    def __init__(self, env, capacity, gamma, mixer_state="joint", hidden_size=0, state_scale=1.0):
-        self.capacity, self.gamma, self.mixer_state, self.hidden_size = capacity, gamma, mixer_state, hidden_size
-        self.state_scale = state_scale
-        n, rows, real = env.n_agents, env.horizon + 1, env.state_size * (mixer_state == "real")
-        obs_size = env.single_observation_space.shape[1]
-        self.per_decision = {"obs": (obs_size,), "action": (), "row": (), "hidden": (hidden_size,)}
-        self.per_row = {"latest": (n,), "state": (env.state_size,), "last_state": (real,), "reward": (), "discount": ()}
-
-        def arrays(episodes):
-            dtypes = dict.fromkeys(("action", "row", "latest"), np.int16)
-            sizes = {key: (n, rows, *size) for key, size in self.per_decision.items()}
-            sizes |= {key: (rows, *size) for key, size in self.per_row.items()}
-            data = {key: np.zeros((episodes, *size), dtypes.get(key, np.float32)) for key, size in sizes.items()}
-            return data | {"decisions": np.zeros((episodes, n), np.int64), "rows": np.zeros(episodes, np.int64)}
-
-        self.current, self.data, self.size, self.next = arrays(env.num_envs), arrays(capacity), 0, 0
-
-    def decide(self, free, obs, actions, state, hidden):
-        """Notes a decision row wherever an agent is free: bool [N, n], float32 [N, n, d], int [N, n], float32 [N, S].
-        hidden: the recurrent states before the decision, float32 [n, N, H]."""
-        now = self.current
-        env, agent = np.nonzero(free)
-        decision = now["decisions"][env, agent]
-        now["obs"][env, agent, decision] = obs[env, agent]
-        now["action"][env, agent, decision] = actions[env, agent]
-        now["row"][env, agent, decision] = now["rows"][env]
-        if self.hidden_size:
-            now["hidden"][env, agent, decision] = hidden.cpu().numpy()[agent, env]
-        now["decisions"] += free
-        env = np.flatnonzero(free.any(1))
-        row = now["rows"][env]
-        now["latest"][env, row], now["state"][env, row] = now["decisions"][env] - 1, state[env]
-        now["reward"][env, row], now["discount"][env, row] = 0.0, 1.0
-        now["rows"][env] += 1
-
-    def reward(self, rewards, state):
-        """Adds a step's rewards, float64 [N], to the running rows: r += gamma^t r_t. state: the one before the step."""
-        now, env = self.current, np.arange(len(rewards))
-        row = now["rows"] - 1
-        now["reward"][env, row] += now["discount"][env, row] * rewards
-        now["discount"][env, row] *= self.gamma
-        if self.mixer_state == "real":
-            now["last_state"][env, row] = state
-
-    def finish(self, over, terminated, obs, state, hidden):
-        """Ends the episodes in over, bool [N], with their final observation, and moves them to the replay memory."""
-        now, env = self.current, np.flatnonzero(over)
-        now["discount"][env, now["rows"][env] - 1] *= ~terminated[env]  # a truncated episode bootstraps
-        everybody = np.repeat(over[:, None], obs.shape[1], 1)
-        self.decide(everybody, obs, np.zeros(everybody.shape, int), state, hidden)
-        slots = (self.next + np.arange(len(env))) % self.capacity
-        for key, array in self.data.items():
-            array[slots] = now[key][env]
-        now["decisions"][env], now["rows"][env] = 0, 0
-        self.size, self.next = min(self.size + len(env), self.capacity), (self.next + len(env)) % self.capacity
-
-    def sample(self, batch_size, window, rng, device="cpu"):
-        """A Batch of windows, each from a random episode, in which every row of the episode is as likely as any other.
-
-        Windows therefore reach over both ends of the episode and are cut there: had all of them to fit in, the first
-        row and the last, which often has the reward, would be in one of final - window + 1 only.
-        """
-        episode = rng.integers(self.size, size=batch_size)
-        start = rng.integers(1 - window, self.data["rows"][episode] - 1)
-        return self.windows(episode, np.maximum(start, 0), np.minimum(start, 0) + window, device)
-
-    def windows(self, episode, start, window, device="cpu"):
-        """The Batch of windows of these episodes from these rows on, int [B] each; window: their rows, int or [B]."""
-        data, agents, batch_size = self.data, np.arange(self.data["decisions"].shape[1]), len(episode)
-        end = np.minimum(start + window, data["rows"][episode] - 1)  # the last row is that of the final observation
-
-        # Each agent's own decisions: from its latest one at the first row, which may precede it, to that at the last
-        first, last = data["latest"][episode, start].astype(int), data["latest"][episode, end]  # [B, agents]
-        length = last - first + 1
-        rank = np.argsort(np.argsort(-length, axis=0, kind="stable"), axis=0)
-        alive = np.arange(length.max()) < length[..., None]  # [B, agents, steps]
-        sizes = alive.sum(0).max(0)
-        offset = np.cumsum(sizes) - sizes
-        b, agent, step = np.nonzero(alive)
-        decision, at = (episode[b], agent, first[b, agent] + step), (agent, offset[step] + rank[b, agent])
-        obs = np.zeros((len(agents), sizes.sum(), data["obs"].shape[-1]), np.float32)
-        action, previous = np.zeros(obs.shape[:2], np.int64), np.full(obs.shape[:2], -1)
-        obs[at], action[at] = data["obs"][decision], data["action"][decision]
-        before = data["action"][episode[b], agent, decision[2] - 1]
-        previous[at] = np.where(decision[2] > 0, before, -1)
-        hidden = None
-        if self.hidden_size:
-            hidden = np.zeros((len(agents), batch_size, self.hidden_size), np.float32)
-            hidden[agents, rank] = data["hidden"][episode[:, None], agents, first]
-
-        # The joint rows
-        valid = start[:, None] + np.arange(np.max(end - start)) < end[:, None]  # [B, W]
-        b, k = np.nonzero(valid)  # [R] each
-        episode, row = episode[b], start[b] + k
-        latest, next_latest = data["latest"][episode, row], data["latest"][episode, row + 1]  # [R, agents]
-        entry, next_entry = (offset[of - first[b]] + rank[b] for of in (latest, next_latest))
-        own_row = data["row"][episode[:, None], agents, latest]  # [R, agents], where each made its latest decision
-        next_own_row = data["row"][episode[:, None], agents, next_latest]
-        chosen, next_chosen = own_row == row[:, None], next_own_row == row[:, None] + 1
-        next_state = data["state"][episode, row + 1]
-        if self.mixer_state == "joint":
-            state = data["state"][episode[:, None], own_row].reshape(len(row), -1)  # [R, agents * S]
-            next_state = data["state"][episode[:, None], next_own_row].reshape(len(row), -1)  # the same
-        elif self.mixer_state == "single":  # of the first agent whose macro-action ends with the row's interval
-            state = data["state"][episode, own_row[np.arange(len(row)), next_chosen.argmax(1)]]
-        else:
-            state = data["last_state" if self.mixer_state == "real" else "state"][episode, row]
-        state, next_state = np.float32(self.state_scale) * state, np.float32(self.state_scale) * next_state
-        batch = Batch(obs, previous, action, hidden, sizes.tolist(), entry, next_entry, chosen, next_chosen, state,
-                      next_state, data["reward"][episode, row], data["discount"][episode, row], valid)  # fmt: skip
-        return Batch(*(torch.from_numpy(x).to(device) if isinstance(x, np.ndarray) else x for x in batch))
-
-    def _parts(self):
-        """(collected or replayed, array's name, array, what of it is filled): all that a checkpoint needs."""
-        for part, data, count in (("current", self.current, len(self.current["rows"])), ("data", self.data, self.size)):
-            yield from ((part, key, data[key][:count], ...) for key in ("rows", "decisions"))  # first: masks need them
-            steps = np.arange(data["row"].shape[2])
-            decisions, rows = steps < data["decisions"][:count, :, None], steps < data["rows"][:count, None]
-            yield from ((part, key, data[key][:count], decisions) for key in self.per_decision)
-            yield from ((part, key, data[key][:count], rows) for key in self.per_row)
-
-    def save(self):
-        """The buffer as a dict of tensors, for checkpoints."""
-        arrays = {f"{part}/{key}": torch.from_numpy(array[filled]) for part, key, array, filled in self._parts()}
-        return {"size": self.size, "next": self.next, **arrays}
-
-    def load(self, saved):
-        """Continues from what `save` returned."""
-        self.size, self.next = saved["size"], saved["next"]
-        for part, key, array, filled in self._parts():
-            array[filled] = saved[f"{part}/{key}"].numpy()
-
-
-# <<< replay
-
-
-# >>> joint history, identical to dec_maddrqn.py
-class JointHistory(NamedTuple):
-    """The windows of a batch as sequences of joint rows, the row after the last included; T entries in all.
-
-    They are packed as Agents.forward wants them. A macro-action before is the running one of an ongoing agent.
-    """
-
-    obs: torch.Tensor  # float32 [T, n, d], latest macro-observations
-    free: torch.Tensor  # bool [T, n]
-    before: torch.Tensor  # int64 [T, n], the macro-actions up to the row, -1 for none
-    sizes: list  # entries of each step
-    row: torch.Tensor  # int64 [R], the entry of each row of the batch
-    next_row: torch.Tensor  # int64 [R], and of the row after it
-
-
-def joint_history(batch):
-    """The JointHistory of a Batch."""
-    agents, length = torch.arange(len(batch.obs), device=batch.obs.device), batch.valid.sum(1) + 1  # rows [B]
-    rank = length.argsort(descending=True, stable=True).argsort()
-    steps = torch.arange(batch.valid.shape[1] + 1, device=length.device)
-    sizes = (length[:, None] > steps).sum(0)  # [W + 1]
-    offset = sizes.cumsum(0) - sizes
-    window, k = batch.valid.nonzero(as_tuple=True)  # [R] each
-    row, next_row = offset[k] + rank[window], offset[k + 1] + rank[window]
-    entry = batch.entry.new_empty(len(row) + len(length), len(agents))  # [T, agents]
-    free = batch.chosen.new_empty(entry.shape)
-    entry[row], free[row] = batch.entry, batch.chosen
-    entry[next_row], free[next_row] = batch.next_entry, batch.next_chosen
-    before = torch.where(free, batch.previous[agents, entry], batch.action[agents, entry])
+def over_rows(batch, *networks):
+    """Logits or values float32 [B, T, n, A] of each network at the rows of a batch.
+    A macro-history moves only where its agent chooses: networks run over every agent's own decisions, a fraction of the
+    rows. They are packed as Agents.forward wants them, and rows look up the latest one."""
+    chosen = batch["chosen"].movedim(2, 0)  # [n, B, T]
+    step = chosen.cumsum(2) - chosen[..., :1].int()  # [n, B, T], a window begins with what its agents saw last
+    length = step[..., -1:]  # [n, B, 1]
+    rank = length.argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # [n, B, 1]
+    sizes = (length >= torch.arange(step.shape[2], device=step.device)).sum(1).amax(0)  # [T]
+    entry = (sizes.cumsum(0) - sizes)[step] + rank  # [n, B, T], where the latest decision is packed
+    agents = torch.arange(len(step), device=step.device)[:, None, None]
+    obs = batch["obs"].new_zeros(len(step), int(sizes.sum()), batch["obs"].shape[3])  # [n, M, d]
+    previous = batch["previous"].new_zeros(obs.shape[:2])  # [n, M]
+    obs[agents, entry] = batch["obs"].movedim(2, 0)  # rows with the same latest decision write the same
+    previous[agents, entry] = batch["previous"].movedim(2, 0)
     sizes = sizes[sizes > 0].tolist()
-    return JointHistory(batch.obs[agents, entry], free, before, sizes, row, next_row)
+    return [net(obs, previous, net.start(sizes[0]), sizes)[0][agents, entry].movedim(0, 2) for net in networks]
 
 
-# <<< joint history
+def joint_batch(batch, width):
+    """The batch of the critics, which move at every row: each sees what all agents saw last, who is free and the one-hot
+    macro-actions before, of this width."""
+    inside = (batch["valid"] | batch["valid"].roll(1, 1))[..., None]  # [B, T, 1], rows of the episode
+    free = batch["chosen"] | ~inside  # [B, T, n], beyond its end as at its end
+    before = torch.where(free, batch["previous"], batch["action"])  # [B, T, n]
+    before = before[..., None] == torch.arange(width, device=before.device)  # [B, T, n, A]
+    obs = torch.cat([batch["obs"], free[..., None], before], 3)  # [B, T, n, d + 1 + A]
+    obs = obs.flatten(2)[:, :, None].expand(-1, -1, free.shape[2], -1)  # [B, T, n, n * (d + 1 + A)]
+    return dict(obs=obs, previous=torch.full_like(batch["previous"], -1), chosen=inside.expand_as(free))
 
 
-def own_returns(batch, next_values, n_step):
-    """The agents' n-step returns over their own macro-actions, folded from the joint rows of whole episodes.
+class EpisodeBuffer:
+    """Whole episodes of rows (Fig. 2), one array [capacity + N, horizon + 1, ...] for each field of a row.
+    writing: the N episodes that run in the environments. queue: ended ones, the oldest first, after free places."""
 
-    The return of agent i from row k on, where it is running a macro-action, over l of its macro-actions, is
-    X_l[k] = r[k] + gamma^tau (X_l[k + 1] if the macro-action still runs at the next row, else X_{l-1}[k + 1]),
-    X_0 being V'_i, as are all of them at the episode's final row.
+    def __init__(self, env, capacity):
+        n, d = env.single_observation_space.shape
+        fields = {
+            "obs": ((n, d), np.float32),  # what every agent last saw
+            "action": ((n,), np.int64),  # the macro-action that it runs
+            "since": ((n,), np.int64),  # and since which row: its macro-history moves where that is this one
+            "reward": ((), np.float32),  # sum of gamma^t r_t until the next row
+            "discount": ((), np.float32),  # gamma^tau, 0 where the episode terminated
+        }
+        for name, (shape, kind) in fields.items():
+            setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
+        self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
+        self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
 
-    Args:
-        next_values: float32 [R, n], each agent's target critic at the next row. n_step: macro-actions in a return.
+    def add(self, obs, actions, chosen):
+        """Notes a row wherever an agent chooses: float32 [N, n, d], int64 [N, n], bool [N, n]."""
+        env = np.flatnonzero(chosen.any(1))
+        at = episode, row = self.writing[env], self.rows[self.writing[env]]
+        since = np.where(chosen[env], row[:, None], self.since[episode, row - 1])
+        self.obs[at], self.action[at], self.since[at] = obs[env], actions[env], since
+        self.reward[at], self.discount[at] = 0.0, 1.0
+        self.rows[episode] += 1
 
-    Returns:
-        float32 [R, n].
-    """
-    rows = (batch.reward, batch.discount, batch.next_chosen, next_values)
-    reward, discount, ends, value = map(batch.by_window, rows)  # [W, B] twice, [W, B, agents] twice
-    last, returns = ~F.pad(batch.valid, (0, 1))[:, 1:].T, torch.zeros_like(value)  # [W, B], [W, B, agents]
-    later = value.new_zeros(n_step, *value.shape[1:])  # X_1 to X_n at the row after: [n, B, agents]
-    for k in range(len(reward) - 1, -1, -1):
-        later = torch.where(last[k, :, None], value[k], later)
-        one_less = torch.cat([value[k][None], later[:-1]])  # X_0 to X_{n-1}
-        later = reward[k, :, None] + discount[k, :, None] * torch.where(ends[k], one_less, later)
-        returns[k] = later[-1]
-    return returns.transpose(0, 1)[batch.valid]
+    def step(self, rewards, discounts, over, obs, infos):
+        """Adds a step to the running rows, r += gamma^t r_t, and ends the episodes in over, bool [N], with a row for
+        their final observation. rewards, discounts: float64 [N], the latter gamma, 0 at a terminal step."""
+        at = self.writing, self.rows[self.writing] - 1
+        self.reward[at] += self.discount[at] * rewards
+        self.discount[at] *= discounts
+        self.add(obs, infos["macro_action"], infos["macro_done"] & over[:, None])
+        self.writing[over], self.queue = np.split(np.append(self.queue, self.writing[over]), [over.sum()])
+        self.rows[self.writing[over]] = 0
+
+    def take(self, device="cpu"):
+        """The ended episodes, once, as tensors [B, T, ...] by name. `valid` marks rows with a next one."""
+        episode = self.queue[self.rows[self.queue] > 0][:, None]  # [B, 1]
+        last = self.rows[episode] - 1  # [B, 1], the row of the final observation
+        row = np.arange(last.max() + 1)  # [T]
+        at = episode, np.minimum(row, last)
+        since = self.since[at]  # [B, T, n]
+        before = episode[..., None], since - 1, np.arange(since.shape[2])
+        batch = {key: getattr(self, key)[at] for key in ("obs", "action", "reward", "discount")}
+        previous = np.where(since > 0, self.action[before], -1)  # [B, T, n]
+        batch |= dict(valid=row < last, chosen=since == row[:, None], previous=previous)
+        self.rows[episode] = 0
+        return {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
 
 
-def soft_policy(logits, n_actions, epsilon):
-    """(1 - epsilon) softmax(logits) + epsilon / |A_i|, float32 [n, M, A]; padding actions (-inf) have 0."""
-    share = epsilon / torch.as_tensor(n_actions, device=logits.device)[:, None, None]
-    return (1 - epsilon) * logits.softmax(2) + share * (logits > -torch.inf)
+def own_returns(batch, values, n_step):
+    """The agents' n-step returns over their own macro-actions, float32 [B, T, n]. That of agent i from row k on, where it
+    is running a macro-action, over l of its macro-actions, is X_l[k] = r[k] + gamma^tau (X_l[k + 1] if the macro-action
+    still runs at the next row, else X_{l-1}[k + 1]), X_0 being V'_i, as are all of them at the episode's final row.
+    values: float32 [B, T, n], V'_i of each agent's target critic. n_step: macro-actions in a return."""
+    returns, later = (
+        torch.zeros_like(values),
+        values.new_zeros(n_step, *values[:, 0].shape),
+    )  # X_1 to X_n at the next row
+    final = batch["valid"].roll(1, 1) & ~batch["valid"]  # [B, T]
+    for k in reversed(range(values.shape[1] - 1)):
+        later = torch.where(final[:, k + 1, None], values[:, k + 1], later)
+        one_less = torch.cat([values[None, :, k + 1], later[:-1]])  # X_0 to X_{n-1}
+        later = torch.where(batch["chosen"][:, k + 1], one_less, later)
+        later = batch["reward"][:, k, None] + batch["discount"][:, k, None] * later  # [n_step, B, n]
+        returns[:, k] = later[-1]
+    return returns
+
+
+def soft_policy(logits, epsilon):
+    """(1 - epsilon) softmax(logits) + epsilon uniform, float32 [..., A]; macro-actions an agent has not (-inf) get 0."""
+    available = logits > -torch.inf
+    return (1 - epsilon) * logits.softmax(-1) + epsilon * available / available.sum(-1, keepdim=True)
 
 
 def actor_critic_loss(policy, values, returns, batch, entropy_coef):
-    """The loss of actors and critics, each summed over agents, a mean over the rows where the agent chose.
+    """The loss of actors and critics, each summed over agents, a mean over the rows where the agent chose; actors' loss,
+    critics' loss and mean entropy. policy: float32 [B, T, n, A]. values, returns: float32 [B, T, n]."""
+    own = batch["chosen"] & batch["valid"][..., None]  # [B, T, n]
 
-    Args:
-        policy: float32 [n, M, A], of the batch's decisions. values, returns: float32 [R, n], at the batch's rows.
+    def mean(x):  # over each agent's own decisions: [B, T, n] -> [n]
+        return torch.where(own, x, 0.0).sum((0, 1)) / own.sum((0, 1)).clamp(min=1)
 
-    Returns:
-        the loss, and its parts: actors' loss, critics' loss, mean entropy (scalar tensors).
-    """
-    agents, own = torch.arange(len(policy), device=policy.device), batch.chosen
-
-    def mean(x):  # over each agent's own decisions: [R, agents] -> [agents]
-        return torch.where(own, x, 0.0).sum(0) / own.sum(0).clamp(min=1)
-
-    taken = policy[agents, batch.entry, batch.action[agents, batch.entry]]  # [R, agents]
-    entropy = -(policy * policy.clamp(min=1e-8).log()).sum(2)[agents, batch.entry]  # [R, agents]
+    taken = policy.gather(3, batch["action"][..., None])[..., 0]  # [B, T, n]
     actor_loss = -mean(taken.clamp(min=1e-8).log() * (returns - values.detach())).sum()
-    critic_loss, entropy = mean((returns - values).square()).sum(), mean(entropy).sum()
-    return actor_loss + critic_loss - entropy_coef * entropy, (actor_loss, critic_loss, entropy / len(policy))
+    critic_loss = mean((returns - values).square()).sum()
+    entropy = mean(-(policy * policy.clamp(min=1e-8).log()).sum(3))  # [n]
+    return actor_loss + critic_loss - entropy_coef * entropy.sum(), actor_loss, critic_loss, entropy.mean()
 
 
 def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
-    """Macro-actions of the free agents: drawn from their epsilon-soft policies, or without rng the most likely ones.
-
-    Args:
-        obs: float32 [N, n, d] and infos of the environment's last reset or step. hidden: float32 [n, N, H].
-        epsilon: share of the uniform policy. rng: NumPy generator.
-
-    Returns:
-        actions int64 [N, n] (of ongoing agents the running one), recurrent states that moved where an agent is free.
-    """
+    """Macro-actions int64 [N, n], drawn from epsilon-soft policies or, without rng, the most likely, and recurrent states
+    float32 [n, N, H], moved where agents are free. obs, float32 [N, n, d], and infos are those of the environment's last
+    reset or step."""
     free, running = infos["macro_done"], infos["macro_action"]
     by_agent = [torch.from_numpy(x).to(hidden.device).transpose(0, 1) for x in (obs, running, free)]  # [n, N, ...]
     with torch.no_grad():
-        logits, _, states = agents(*by_agent[:2], hidden, [len(obs)])
-        policy = soft_policy(logits, agents.n_actions, epsilon).transpose(0, 1).cpu().numpy()  # [N, agents, actions]
-    if rng is None:
-        actions = policy.argmax(2)
-    else:  # below the last bound, so that rounding cannot choose a padding action
+        logits, states = agents(*by_agent[:2], hidden, [len(obs)])
+    policy = soft_policy(logits, epsilon).transpose(0, 1).cpu().numpy()  # [N, n, A]
+    actions = policy.argmax(2)  # [N, n]
+    if rng:  # below the last bound, so that rounding cannot choose a macro-action that an agent has not
         bounds = policy.cumsum(2)
         actions = (rng.random(free.shape)[..., None] * bounds[..., -1:] >= bounds).sum(2)
     return np.where(free, actions, running), torch.where(by_agent[2][..., None], states, hidden)
 
 
-# >>> evaluation, identical to avf_vdn.py
-def evaluate(agents, env, gamma, seed, frames=None):
-    """Greedy play: the first episode of each environment of a batch, reset with the seed.
-
-    Returns a dict of float64 [N]: return, discounted_return, length, success (0 or 1). frames: a list that receives the
-    pictures of environment 0.
-    """
+def evaluate(agents, env, gamma, seed):
+    """Greedy play: return, discounted_return, length, success of each environment's first episode, float64 [N] each."""
     obs, infos = env.reset(seed=seed)
-    hidden = agents.start(env.num_envs)
-    result = {key: np.zeros(env.num_envs) for key in ("return", "discounted_return", "length", "success")}
-    live, step = np.ones(env.num_envs, bool), 0
-    if frames is not None:
-        frames.append(env.render()[0])
+    hidden, live, step, result = agents.start(env.num_envs), np.ones(env.num_envs, bool), 0, {}
     while live.any():
         actions, hidden = act(agents, obs, infos, hidden)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        result["return"] += live * rewards
-        result["discounted_return"] += live * gamma**step * rewards
-        result["length"] += live
-        result["success"] += live & infos["success"]
-        if frames is not None and live[0]:
-            frames.append(env.render()[0])
-        over, step = terminations | truncations, step + 1
+        new = {"return": rewards, "discounted_return": gamma**step * rewards, "length": 1, "success": infos["success"]}
+        result = {key: result.get(key, 0.0) + live * value for key, value in new.items()}
+        over = terminations | truncations
         live &= ~over
-        if over.any():  # play on in ended environments without looking
-            obs, infos = env.reset(options={"reset_mask": over})
-            hidden[:, over] = 0.0
+        step += 1
+        obs, infos = env.reset(options={"reset_mask": over})  # play on in ended environments without looking
+        hidden[:, over] = 0.0
     return result
 
 
-# <<< evaluation
-
-
 def make_learner(args, env):
-    """Actors and critics as one module on the device, and the buffer that collects the episodes of an update."""
-    sizes = env.single_observation_space.shape[1], args.hidden_size, args.obs_scale
-    actors, critics = (kind(env.n_actions, *sizes) for kind in (Agents, Critics))
-    buffer = ReplayBuffer(env, args.batch_size + args.num_envs, args.gamma, "decision")
-    return nn.ModuleDict({"agents": actors, "critics": critics}).to(args.device), buffer
+    """Actors and critics as one module on the device."""
+    (n, d), sizes = env.single_observation_space.shape, (args.hidden_size, args.obs_scale)
+    critics = Agents([1] * n, n * (d + 1 + max(env.n_actions)), *sizes)
+    return nn.ModuleDict({"agents": Agents(env.n_actions, d, *sizes), "critics": critics}).to(args.device)
 
 
-# >>> training, identical to avf_vdn.py
-def train(args):
-    """Trains from Args, or goes on with the run args.resume; returns the run folder."""
-    check(args)
-    torch.set_num_threads(args.torch_threads)
+def train(args, stop=()):
+    """Trains from Args, or goes on with the run args.resume, until something is in stop; returns the run folder."""
+    torch.set_num_threads(1)  # fastest for networks of this size
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
     env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
-    learner, buffer = make_learner(args, env)
-    target = copy.deepcopy(learner).requires_grad_(False)
-    agents = learner["agents"]
-    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
+    learner = make_learner(args, env)
+    target, agents = copy.deepcopy(learner["critics"]).requires_grad_(False), learner["agents"]
+    fast, slow = list(learner.parameters()), list(target.parameters())
+    optimizer = torch.optim.Adam(fast, lr=args.learning_rate, fused=True)
+    buffer = EpisodeBuffer(env, args.batch_size + args.num_envs)
+    obs, infos = env.reset(seed=args.seed)
+    hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
+    folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
+    if args.track:
+        import wandb  # optional: pip install -e '.[track]'
+
+        wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
     if args.resume:
-        folder, saved = Path(args.resume), load_file(args.resume, "checkpoint.pt", args.env)
-        for name, part in (("learner", learner), ("target", target), ("optimizer", optimizer)):
-            part.load_state_dict(saved[name])
-        buffer.load(saved["buffer"])
+        saved = load(folder / "checkpoint.pt")
+        for part, state in zip((learner, target, optimizer), saved["parts"], strict=True):
+            part.load_state_dict(state)
+        vars(buffer).update({key: value.numpy() for key, value in saved["buffer"].items()})
         obs, infos = env.load_state(saved["env"])
-        hidden, rng.bit_generator.state = saved["hidden"].to(args.device), saved["rng"]
-        step, updates, recent, models = saved["step"], saved["updates"], saved["recent"], saved["models"]
+        rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
+        step, updates, recent, best = saved["progress"]
     else:
-        folder = make_run_folder(args)
-        obs, infos = env.reset(seed=args.seed)
-        hidden = agents.start(args.num_envs)
-        step, updates, recent, models = 0, 0, [], {}
-    tracker = start_tracking(args, folder) if args.track else None
+        folder.mkdir(parents=True)
+        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
+        (folder / "args.json.new").replace(folder / "args.json")
     writer = SummaryWriter(folder, purge_step=step + 1)
-    table = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
-    writer.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}", step)
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
+    started, first_step, saved_at = time.time(), step, time.time()
 
-    def save_checkpoint():
-        saved = {"learner": learner.state_dict(), "target": target.state_dict(), "optimizer": optimizer.state_dict()}
-        arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
-        saved |= {"buffer": buffer.save(), "env": arrays, "hidden": hidden, "rng": rng.bit_generator.state}
-        writer.flush()  # what was logged up to here is not logged again after a resume
-        saved |= {"step": step, "updates": updates, "recent": recent, "models": models, "run": [ALGORITHM, args.env]}
-        save(saved, folder / "checkpoint.pt")
+    def log(group, **values):
+        for key, value in values.items():
+            writer.add_scalar(f"{group}/{key}", value, step)
 
-    # Ctrl-C and a termination signal take effect between two steps, where a checkpoint is whole; a second one at once.
-    stop = []
-
-    def request_stop(number, frame):
-        stop.append(number)
-        signal.signal(number, handlers[number])
-
-    handlers = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    layout = "{percentage:3.0f}%|{bar:10}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
-    bar = tqdm(total=args.total_timesteps, initial=step, disable=not sys.stderr.isatty(), bar_format=layout)
-    started, first_step = time.time(), step
     while step < args.total_timesteps and not stop:
         # Choose and step
-        progress = min(1.0, step / args.exploration_timesteps)
+        progress, done = min(1.0, step / args.exploration_timesteps), step / args.total_timesteps
         epsilon = args.start_e + progress * (args.end_e - args.start_e)
         if args.learning_rate_end is not None:
-            done = step / args.total_timesteps
             optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
-        actions, moved = act(agents, obs, infos, hidden, epsilon, rng)
-        state = infos["state"]
-        buffer.decide(infos["macro_done"], obs, actions, state, hidden)
+        actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
+        buffer.add(obs, actions, infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        buffer.reward(args.reward_scale * rewards, state)
-        hidden, step = moved, step + args.num_envs
-
-        # Store the episodes that ended and start new ones
-        over = terminations | truncations
+        over, discounts = terminations | truncations, np.float32(args.gamma) * ~terminations
+        buffer.step(args.reward_scale * rewards, discounts, over, obs, infos)
+        step += args.num_envs
+        bar.update(args.num_envs)
         if over.any():
-            buffer.finish(over, terminations, obs, infos["state"], hidden)
-            recent += zip(env.episode_return[over].tolist(), env.elapsed[over].tolist(), strict=True)
+            recent += env.episode_return[over].tolist()
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
 
-        # <<< training
         # Learn from the episodes that ended, once
-        if buffer.size >= args.batch_size:
-            batch = buffer.windows(np.arange(buffer.size), np.zeros(buffer.size, int), env.horizon, args.device)
-            buffer.size = buffer.next = 0
-            joint = joint_history(batch)
-            logits, _, _ = agents(batch.obs, batch.previous, None, batch.sizes)
-            values = learner["critics"].values(joint)[:, joint.row].T  # [R, agents]
-            with torch.no_grad():
-                next_values = target["critics"].values(joint)[:, joint.next_row].T
-            returns = own_returns(batch, next_values, args.n_step)
-            policy = soft_policy(logits, agents.n_actions, epsilon)
-            loss, (actor_loss, critic_loss, entropy) = actor_critic_loss(
-                policy, values, returns, batch, args.entropy_coef
-            )
+        if np.count_nonzero(buffer.rows[buffer.queue]) >= args.batch_size:
+            batch = buffer.take(args.device)
+            joint = joint_batch(batch, max(env.n_actions))
+            values, target_values = (x[..., 0] for x in over_rows(joint, learner["critics"], target))  # [B, T, n]
+            policy = soft_policy(over_rows(batch, agents)[0], epsilon)  # [B, T, n, A]
+            returns = own_returns(batch, target_values, args.n_step)
+            losses = actor_critic_loss(policy, values, returns, batch, args.entropy_coef)
             optimizer.zero_grad()
-            loss.backward()
-            grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
+            losses[0].backward()
+            grad_norm = nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
             optimizer.step()
-            for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
-                slow.data.lerp_(fast.data, 1 - args.polyak)
+            critics = list(learner["critics"].parameters())
+            torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)(slow, critics, None)
             updates += 1
             if updates % 10 == 0:
-                writer.add_scalar("losses/actor_loss", actor_loss.item(), step)
-                writer.add_scalar("losses/td_loss", critic_loss.item(), step)
-                writer.add_scalar("losses/entropy", entropy.item(), step)
-                writer.add_scalar("losses/q_values", values.mean().item(), step)
-                writer.add_scalar("losses/grad_norm", grad_norm.item(), step)
+                q_values = values[batch["valid"]].mean()
+                log("losses", td_loss=losses[2], q_values=q_values, grad_norm=grad_norm)
+                log("losses", actor_loss=losses[1], entropy=losses[3])
 
-        # >>> logging, identical to avf_vdn.py
         # Log, evaluate, save
-        due = {f: step // f > (step - args.num_envs) // f or step >= args.total_timesteps
-               for f in (2_000, args.eval_frequency, args.checkpoint_frequency)}  # fmt: skip
-        if due[2_000] and recent:
-            sps, (mean_return, mean_length) = (step - first_step) / (time.time() - started), np.mean(recent, 0)
-            for key, value in (("SPS", sps), ("epsilon", epsilon), ("episodic_return", mean_return)):
-                writer.add_scalar(f"charts/{key}", value, step)
-            writer.add_scalar("charts/episodic_length", mean_length, step)
-            bar.set_postfix_str(f"return {mean_return:.1f}, epsilon {epsilon:.2f}, {sps:.0f} steps/s", refresh=False)
-            bar.update(step - bar.n)
+        if step % 2_000 < args.num_envs and recent:
+            sps = (step - first_step) / (time.time() - started)
+            log("charts", SPS=sps, epsilon=epsilon, episodic_return=np.mean(recent))
             recent = []
-        if due[args.eval_frequency]:
-            eval_seed = int(np.random.SeedSequence([args.seed, step]).generate_state(1)[0])
-            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, eval_seed).items()}
-            for key, value in result.items():
-                writer.add_scalar(f"eval/{key}", value, step)
-            model = {"step": step, "return": result["return"], "networks": copy.deepcopy(learner.state_dict())}
-            models = {"last": model, "best": max(models.get("best", model), model, key=lambda m: m["return"])}
-            save({"run": [ALGORITHM, args.env], **models}, folder / "model.pt")
+        if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
+            seed = args.seed * 10**9 + step  # fresh episodes
+            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, seed).items()}
+            log("eval", **result)
+            model = dict(step=step, networks=learner.state_dict(), **result)
+            save(folder / "last.pt", args, **model)
+            if result["return"] >= best:
+                best = result["return"]
+                save(folder / "best.pt", args, **model)
             bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
-        if due[args.checkpoint_frequency]:
-            save_checkpoint()
+        if time.time() - saved_at > args.checkpoint_frequency or stop:
+            writer.flush()  # what was logged up to here is not logged again after a resume
+            arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
+            parts = [part.state_dict() for part in (learner, target, optimizer)]
+            memory = {key: torch.from_numpy(value) for key, value in vars(buffer).items()}
+            progress = step, updates, recent, best
+            save(folder / "checkpoint.pt", args, parts=parts, buffer=memory, env=arrays, hidden=hidden,
+                 rng=rng.bit_generator.state, progress=progress)  # fmt: skip
+            saved_at = time.time()
 
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
     bar.close()
-    if stop:
-        save_checkpoint()
-        print(f"stopped at step {step}; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
     writer.close()
-    if tracker:
-        tracker.finish()
+    if step >= args.total_timesteps:
+        (folder / "checkpoint.pt").unlink(missing_ok=True)
     return folder
 
 
-# <<< logging
-
-
-# >>> runs, identical to avf_vdn.py
-def report(args):
-    """Evaluates the model of the run folder args.evaluate, prints the result and writes the animation args.gif."""
-    check(args)
-    torch.set_num_threads(args.torch_threads)
-    env = envs.make(args.env, args.eval_episodes, render_mode="rgb_array" if args.gif else None)
-    (learner, _), model = make_learner(args, env), load_file(args.evaluate, "model.pt", args.env)[args.model]
-    learner.load_state_dict(model["networks"])
-    frames = [] if args.gif else None
-    result = evaluate(learner["agents"], env, args.gamma, args.seed, frames)
-    print(f"{args.env} {ALGORITHM} {args.model} model of step {model['step']}: {args.eval_episodes} greedy episodes")
-    for key, value in result.items():
-        error = value.std(ddof=1) / len(value) ** 0.5 if len(value) > 1 else float("nan")
-        print(f"{key.replace('_', ' '):17s} {value.mean():9.3f} +- {error:.3f} (standard error)")
-    if args.gif:
-        pictures = [Image.fromarray(frame).quantize(dither=0) for frame in frames]
-        try:
-            pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], duration=150, loop=0)
-        except (OSError, ValueError) as error:
-            fail(f"cannot write {args.gif}: {error}")
-
-
-def fail(message):
-    """Ends the program with one line."""
-    raise SystemExit(f"{ALGORITHM}: {message}")
-
-
-def check(args):
-    """Ends the program with one line if an argument is out of range."""
-    if args.env not in envs.IDS:
-        fail(f"unknown --env {args.env!r}; valid ids: {' '.join(envs.IDS)}")
-    zero_to_one = "gamma polyak start_e end_e td_lambda hysteresis_start hysteresis_end".split()
-    from_zero = ["seed", "learning_starts", "learning_rate", "learning_rate_end", "max_grad_norm", "reward_scale"]
-    from_zero += ["obs_scale", "entropy_coef"]
-    for field in fields(args):
-        value, name = getattr(args, field.name), "--" + field.name.replace("_", "-")
-        if field.name in zero_to_one and not 0 <= value <= 1:
-            fail(f"{name} must be between 0 and 1, got {value}")
-        if field.name in from_zero and value is not None and not 0 <= value < float("inf"):
-            fail(f"{name} must not be negative, got {value}")
-        if type(value) is int and field.name not in from_zero and value < 1:
-            fail(f"{name} must be at least 1, got {value}")
-    if args.track and importlib.util.find_spec("wandb") is None:
-        fail("--track needs Weights & Biases: pip install -e '.[track]'")
-    try:
-        torch.zeros(1, device=args.device)
-    except (RuntimeError, AssertionError) as error:
-        fail(f"--device {args.device} is not available: {str(error).splitlines()[0]}")
-
-
-def start_tracking(args, folder):
-    """A Weights & Biases run that copies what is written to TensorBoard; a resumed run goes on in its own."""
-    import wandb  # optional
-
-    return wandb.init(project=args.wandb_project_name, entity=args.wandb_entity, name=folder.name, id=folder.name,
-                      resume="allow", config=asdict(args), sync_tensorboard=True, dir=folder.parent)  # fmt: skip
-
-
-def save(saved, path):
+def save(path, args, **content):
     """Writes beside the file and swaps, so that a kill at any moment leaves the old one or the new one."""
-    torch.save(saved, f"{path}.new")
-    os.replace(f"{path}.new", path)
+    torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, f"{path}.new")
+    Path(f"{path}.new").replace(path)
 
 
-def load_file(folder, name, env_id):
-    """What `save` wrote in a run folder, on the CPU; it must be of this algorithm and task."""
+def load(path):
+    """What `save` wrote, on the CPU."""
     try:
-        saved = torch.load(Path(folder) / name, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        fail(f"there is no {name} in {folder}")
+        saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
+        if saved["algorithm"] != ALGORITHM:
+            raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
+        return saved
     except Exception as error:  # torch names no common class for what a damaged file raises
-        fail(f"{Path(folder) / name} is damaged: {str(error).splitlines()[0]}")
-    if saved["run"] != [ALGORITHM, env_id]:
-        fail(f"{Path(folder) / name} is of {' on '.join(saved['run'])}, not of {ALGORITHM} on {env_id}")
-    return saved
-
-
-def make_run_folder(args):
-    """Makes runs_dir/<env>__<script>__<seed>__<time>, a new folder for each run, with args.json in it."""
-    stem, tries = f"{args.env}__{ALGORITHM}__{args.seed}__{int(time.time())}", 0
-    try:
-        Path(args.runs_dir).mkdir(parents=True, exist_ok=True)
-        while True:
-            folder = Path(args.runs_dir) / (f"{stem}-{tries}" if tries else stem)
-            try:
-                folder.mkdir()
-                break
-            except FileExistsError:  # another run of the same second
-                tries += 1
-        (folder / "args.json").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2) + "\n")
-    except OSError as error:
-        fail(f"cannot write to --runs-dir {args.runs_dir}: {error.strerror}")
-    return folder
-
-
-def load_args(folder):
-    """The Args of a run folder."""
-    try:
-        saved = json.loads((Path(folder) / "args.json").read_text())
-        algorithm = saved.pop("algorithm")
-        if algorithm != ALGORITHM:
-            fail(f"{folder} is a run of {algorithm}, not of {ALGORITHM}")
-        return Args(**saved)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        fail(f"{folder} is not a run folder: args.json: {error}")
-
-
-def defaults(env_id, **overrides):
-    """The Args in force for a task; overrides are fields by name."""
-    return Args(**{"env": env_id, **DEFAULTS.get(env_id.split("-")[0], {}), **overrides})
+        raise SystemExit(f"cannot read {path}: {str(error).splitlines()[0]}") from None
 
 
 def parse_args(argv=None):
-    """Args from the command line, over the defaults of the environment family or the settings of the run continued."""
+    """Args from the command line, over the defaults of the task's family or the settings of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--env", "--resume", "--evaluate"):
-        peek.add_argument(flag)
-    known = peek.parse_known_args(argv)[0]
-    if known.resume and known.evaluate:
-        fail("--resume and --evaluate exclude each other")
-    folder = known.resume or known.evaluate
-    base = load_args(folder) if folder else defaults(known.env or Args.env)
-    args = tyro.cli(Args, default=base, args=argv)
-    may_change = {"resume", "evaluate", "device", "torch_threads", "track", "wandb_project_name", "wandb_entity"}
-    evaluation, training = {"eval_episodes", "gif", "model", "seed"}, {"total_timesteps", "checkpoint_frequency"}
-    may_change |= evaluation if args.evaluate else training
-    for field in fields(Args):
-        old, new = getattr(base, field.name), getattr(args, field.name)
-        if folder and old != new and field.name not in may_change:
-            fail(f"--{field.name.replace('_', '-')} {new} does not fit: {folder} is a run with {old}")
+    peek.add_argument("--env")
+    peek.add_argument("--resume")
+    known, others = peek.parse_known_args(argv)
+    if known.resume and (known.env or others):
+        raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
+    if known.resume:
+        return Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
+    env = known.env or Args.env
+    args = tyro.cli(Args, default=Args(env=env, **DEFAULTS.get(env.split("-")[0], {})), args=argv)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda: there is none")
     return args
 
 
-def main():
-    args = parse_args()
-    if args.evaluate:
-        report(args)
-    else:
-        print(train(args))
-
-
 if __name__ == "__main__":
-    main()
-# <<< runs
+    stop = []  # Ctrl-C or a termination signal: end between two steps, where a checkpoint is whole
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
+    try:
+        print(folder := train(parse_args(), stop))
+    except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
+        raise SystemExit(error) from None
+    if (folder / "checkpoint.pt").exists():
+        print(f"stopped; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
+        sys.exit(128 + stop[0])
