@@ -70,10 +70,7 @@ class Args:
     obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
     reward_scale: float = 1.0  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.0  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
-    hysteresis_start: float = (
-        1.0  # factor on negative TD errors at the start; 1 is the paper's loss, less is optimistic
-    )
-    hysteresis_end: float = 1.0  # that factor from exploration_timesteps on, reached linearly
+    hysteresis: float = 1.0  # factor on negative TD errors, 1 from 2 * exploration_timesteps on; 1 is the paper's loss
     hidden_size: int = 64  # width of the agents' layers
     mixer_state: Literal["joint", "single", "real", "decision"] = "joint"  # what it sees, see ReplayBuffer.sample
     mask_ongoing: bool = True  # ongoing agents have advantage 0 (deviation 1)
@@ -81,7 +78,7 @@ class Args:
     def __post_init__(self):
         if self.env not in envs.IDS:
             raise SystemExit(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
-        shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis_start hysteresis_end"
+        shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis"
         for name, value in vars(self).items():
             low = type(value) is int and name not in ("seed", "learning_starts")
             high = 1 if name in shares.split() else float("inf")
@@ -91,8 +88,7 @@ class Args:
 
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
-               td_lambda=0.5, hysteresis_start=0.3),
+    "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, td_lambda=0.5, hysteresis=0.1),
     "ct": dict(total_timesteps=600_000, num_envs=128, learning_rate=1e-3, learning_rate_end=0.0, gamma=0.9,
                buffer_size=5_000, exploration_timesteps=150_000, train_frequency=256, obs_scale=4.0, reward_scale=10.0,
                td_lambda=0.8, hidden_size=32, eval_frequency=40_000, eval_episodes=400),
@@ -193,8 +189,8 @@ class QPLEXMixer(nn.Module):
         advantages = (weight * (utilities - values)).detach()  # teaches lambda_i, not the utilities
         one_hot = nn.functional.one_hot(actions, self.widest).flatten(-2)  # [..., n * A]
         action = self.of_action(torch.cat([state, one_hot], -1))
-        agent, action = (torch.sigmoid(x.unflatten(-1, (self.heads, n))) for x in (agent, action))  # [..., heads, n]
-        lambdas = (key.abs()[..., None] * agent * action).sum(-2)  # [..., n], not negative: no gain by being worse
+        attention = (torch.sigmoid(agent) * torch.sigmoid(action)).unflatten(-1, (self.heads, n))  # [..., heads, n]
+        lambdas = (key.abs()[..., None] * attention).sum(-2)  # [..., n], not negative: no agent gains by being worse
         return (weight * utilities + bias + (lambdas - 1) * advantages).sum(-1)
 
 
@@ -280,14 +276,13 @@ def td_loss(utilities, target_utilities, mixer, target_mixer, batch, td_lambda=0
         best_q = target_utilities.gather(3, best[..., None])[..., 0]  # [B, T, n]
         inputs = (best_q, target_utilities.amax(3), best, chosen, batch["next_state"])
         bootstrap = target_mixer(*(x[there] for x in inputs))  # [R]
-        target = batch["reward"][here] + batch["discount"][here] * bootstrap  # [R]
-        if td_lambda > 0:  # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
-            returns, later = torch.zeros(2, *here.shape, device=q.device)  # [B, T] each
-            returns[here], later[here] = target, bootstrap
-            decay = td_lambda * batch["discount"] * here.roll(-1, 1)  # the last row has no further return
-            for k in reversed(range(here.shape[1] - 1)):
-                returns[:, k] += decay[:, k] * (returns[:, k + 1] - later[:, k])
-            target = returns[here]
+        following = torch.zeros_like(batch["reward"]).masked_scatter(here, bootstrap)  # [B, T]
+        later, returns = bootstrap.new_zeros(len(here)), torch.zeros_like(following)  # [B], [B, T]
+        share = td_lambda * here.roll(-1, 1)  # [B, T], the return of a window's last row has no further one in it
+        for k in reversed(range(here.shape[1])):  # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
+            later = batch["reward"][:, k] + batch["discount"][:, k] * torch.lerp(following[:, k], later, share[:, k])
+            returns[:, k] = later
+        target = returns[here]  # [R]
     error = target - q
     return torch.where(error < 0, hysteresis * error, error).square().mean(), q, target
 
@@ -301,8 +296,7 @@ def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
         utilities, states = agents(*by_agent[:2], hidden, [len(obs)])
     actions = utilities.argmax(2).T.cpu().numpy()  # [N, n]
     if epsilon > 0:
-        explore, any_action = rng.random((2, *free.shape))
-        actions = np.where(explore < epsilon, (any_action * agents.n_actions).astype(np.int64), actions)
+        actions = np.where(rng.random(free.shape) < epsilon, rng.integers(agents.n_actions, size=free.shape), actions)
     return np.where(free, actions, running), torch.where(by_agent[2][..., None], states, hidden)
 
 
@@ -371,15 +365,15 @@ def train(args, stop=()):
 
     while step < args.total_timesteps and not stop:
         # Choose and step
-        progress, done = min(1.0, step / args.exploration_timesteps), step / args.total_timesteps
-        epsilon = 1.0 + progress * (args.end_e - 1.0)
+        progress, done = step / args.exploration_timesteps, step / args.total_timesteps
+        epsilon = np.interp(progress, [0, 1], [1.0, args.end_e])
         if args.learning_rate_end is not None:
             optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.add(obs, actions, infos["macro_done"], state)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over, discounts = terminations | truncations, np.float32(args.gamma) * ~terminations
+        over, discounts = terminations | truncations, args.gamma * ~terminations
         buffer.step(state, args.reward_scale * rewards, discounts, over, obs, infos)
         step += args.num_envs
         bar.update(args.num_envs)
@@ -392,7 +386,7 @@ def train(args, stop=()):
         while updates < (step - args.learning_starts) // args.train_frequency and buffer.rows[buffer.queue].any():
             batch = buffer.sample(args.batch_size, args.window, args.mixer_state, rng, args.device)
             utilities = over_rows(batch, agents, target["agents"])
-            beta = args.hysteresis_start + progress * (args.hysteresis_end - args.hysteresis_start)
+            beta = np.interp(progress, [1, 2], [args.hysteresis, 1.0])  # optimistic while the others explore
             loss, joint_q, _ = td_loss(*utilities, learner["mixer"], target["mixer"], batch, args.td_lambda, beta)
             optimizer.zero_grad()
             loss.backward()

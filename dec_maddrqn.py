@@ -72,16 +72,13 @@ class Args:
     obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
     reward_scale: float = 1.0  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.0  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
-    hysteresis_start: float = (
-        1.0  # factor on negative TD errors at the start; 1 is the paper's loss, less is optimistic
-    )
-    hysteresis_end: float = 1.0  # that factor from exploration_timesteps on, reached linearly
+    hysteresis: float = 1.0  # factor on negative TD errors, 1 from 2 * exploration_timesteps on; 1 is the paper's loss
     hidden_size: int = 64  # width of the agents' layers
 
     def __post_init__(self):
         if self.env not in envs.IDS:
             raise SystemExit(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
-        shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis_start hysteresis_end"
+        shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis"
         for name, value in vars(self).items():
             low = type(value) is int and name not in ("seed", "learning_starts")
             high = 1 if name in shares.split() else float("inf")
@@ -91,8 +88,7 @@ class Args:
 
 # Where the environment families need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, exploration_timesteps=500_000,
-               hysteresis_start=0.2, hysteresis_end=0.4),
+    "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, td_lambda=0.5, hysteresis=0.1),
     "ct": dict(total_timesteps=600_000, num_envs=128, learning_rate=1e-3, learning_rate_end=0.0, gamma=0.9,
                buffer_size=5_000, exploration_timesteps=150_000, train_frequency=256, obs_scale=4.0, reward_scale=10.0,
                td_lambda=0.8, hidden_size=32, eval_frequency=40_000, eval_episodes=400),
@@ -262,8 +258,7 @@ def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
         utilities, states = agents(*by_agent[:2], hidden, [len(obs)])
     actions = utilities.argmax(2).T.cpu().numpy()  # [N, n]
     if epsilon > 0:
-        explore, any_action = rng.random((2, *free.shape))
-        actions = np.where(explore < epsilon, (any_action * agents.n_actions).astype(np.int64), actions)
+        actions = np.where(rng.random(free.shape) < epsilon, rng.integers(agents.n_actions, size=free.shape), actions)
     return np.where(free, actions, running), torch.where(by_agent[2][..., None], states, hidden)
 
 
@@ -330,14 +325,14 @@ def train(args, stop=()):
 
     while step < args.total_timesteps and not stop:
         # Choose and step
-        progress, done = min(1.0, step / args.exploration_timesteps), step / args.total_timesteps
-        epsilon = 1.0 + progress * (args.end_e - 1.0)
+        progress, done = step / args.exploration_timesteps, step / args.total_timesteps
+        epsilon = np.interp(progress, [0, 1], [1.0, args.end_e])
         if args.learning_rate_end is not None:
             optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         buffer.add(obs, actions, infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over, discounts = terminations | truncations, np.float32(args.gamma) * ~terminations
+        over, discounts = terminations | truncations, args.gamma * ~terminations
         buffer.step(args.reward_scale * rewards, discounts, over, obs, infos)
         step += args.num_envs
         bar.update(args.num_envs)
@@ -350,7 +345,7 @@ def train(args, stop=()):
         while updates < (step - args.learning_starts) // args.train_frequency and buffer.rows[buffer.queue].any():
             batch = buffer.sample(args.batch_size, args.window, rng, args.device)
             utilities = over_rows(batch, agents, target["agents"])
-            beta = args.hysteresis_start + progress * (args.hysteresis_end - args.hysteresis_start)
+            beta = np.interp(progress, [1, 2], [args.hysteresis, 1.0])  # optimistic while the others explore
             loss, q, _, _ = own_loss(*utilities, batch, args.td_lambda, beta)
             optimizer.zero_grad()
             loss.backward()

@@ -163,8 +163,8 @@ def over_rows(batch, *networks):
 
 
 def joint_batch(batch, width):
-    """The batch of the critics, which move at every row: each sees what all agents saw last, who is free and the one-hot
-    macro-actions before, of this width."""
+    """The batch of the critics, which move at every row: each sees what all agents saw last, who is free and the
+    macro-actions before, one-hot and this wide."""
     inside = (batch["valid"] | batch["valid"].roll(1, 1))[..., None]  # [B, T, 1], rows of the episode
     free = batch["chosen"] | ~inside  # [B, T, n], beyond its end as at its end
     before = torch.where(free, batch["previous"], batch["action"])  # [B, T, n]
@@ -227,8 +227,8 @@ class EpisodeBuffer:
 
 
 def own_returns(batch, values, n_step):
-    """The agents' n-step returns over their own macro-actions, float32 [B, T, n]. That of agent i from row k on, where it
-    is running a macro-action, over l of its macro-actions, is X_l[k] = r[k] + gamma^tau (X_l[k + 1] if the macro-action
+    """The agents' n-step returns over their own macro-actions, float32 [B, T, n]. That of agent i from row k on, where
+    it runs a macro-action, over l of its macro-actions, is X_l[k] = r[k] + gamma^tau (X_l[k + 1] if the macro-action
     still runs at the next row, else X_{l-1}[k + 1]), X_0 being V'_i, as are all of them at the episode's final row.
     values: float32 [B, T, n], V'_i of each agent's target critic. n_step: macro-actions in a return."""
     returns, later = (
@@ -246,14 +246,14 @@ def own_returns(batch, values, n_step):
 
 
 def soft_policy(logits, epsilon):
-    """(1 - epsilon) softmax(logits) + epsilon uniform, float32 [..., A]; macro-actions an agent has not (-inf) get 0."""
+    """(1 - epsilon) softmax(logits) + epsilon uniform, float32 [..., A]; 0 for what an agent cannot do (-inf)."""
     available = logits > -torch.inf
     return (1 - epsilon) * logits.softmax(-1) + epsilon * available / available.sum(-1, keepdim=True)
 
 
 def actor_critic_loss(policy, values, returns, batch, entropy_coef):
-    """The loss of actors and critics, each summed over agents, a mean over the rows where the agent chose; actors' loss,
-    critics' loss and mean entropy. policy: float32 [B, T, n, A]. values, returns: float32 [B, T, n]."""
+    """The loss of actors and critics, each summed over agents, a mean over the rows where the agent chose; the actors'
+    and the critics' loss, mean entropy. policy: float32 [B, T, n, A]. values, returns: float32 [B, T, n]."""
     own = batch["chosen"] & batch["valid"][..., None]  # [B, T, n]
 
     def mean(x):  # over each agent's own decisions: [B, T, n] -> [n]
@@ -267,9 +267,9 @@ def actor_critic_loss(policy, values, returns, batch, entropy_coef):
 
 
 def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
-    """Macro-actions int64 [N, n], drawn from epsilon-soft policies or, without rng, the most likely, and recurrent states
-    float32 [n, N, H], moved where agents are free. obs, float32 [N, n, d], and infos are those of the environment's last
-    reset or step."""
+    """Macro-actions int64 [N, n], drawn from epsilon-soft policies or, without rng, the most likely, and recurrent
+    states float32 [n, N, H], moved where agents are free. obs, float32 [N, n, d], and infos are those of the
+    environment's last reset or step."""
     free, running = infos["macro_done"], infos["macro_action"]
     by_agent = [torch.from_numpy(x).to(hidden.device).transpose(0, 1) for x in (obs, running, free)]  # [n, N, ...]
     with torch.no_grad():
@@ -346,14 +346,14 @@ def train(args, stop=()):
 
     while step < args.total_timesteps and not stop:
         # Choose and step
-        progress, done = min(1.0, step / args.exploration_timesteps), step / args.total_timesteps
-        epsilon = args.start_e + progress * (args.end_e - args.start_e)
+        progress, done = step / args.exploration_timesteps, step / args.total_timesteps
+        epsilon = np.interp(progress, [0, 1], [args.start_e, args.end_e])
         if args.learning_rate_end is not None:
             optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         buffer.add(obs, actions, infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over, discounts = terminations | truncations, np.float32(args.gamma) * ~terminations
+        over, discounts = terminations | truncations, args.gamma * ~terminations
         buffer.step(args.reward_scale * rewards, discounts, over, obs, infos)
         step += args.num_envs
         bar.update(args.num_envs)
