@@ -19,9 +19,8 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from avf_qmix import QMIXMixer
 from avf_qplex import QPLEXMixer
-from avf_vdn import VDNMixer
 from theory.igm import mac_igm_batch, situations
-from theory.variants import SeeOngoing
+from theory.variants import SeeOngoing, VDNMixer
 
 
 def joint_tables(mixer, utilities, terminated, state, values=None):

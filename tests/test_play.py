@@ -1,0 +1,390 @@
+"""play.py: what it records is what the environment did, what it prints is right, and its pictures can be read."""
+
+import dataclasses
+import importlib
+import json
+import re
+from itertools import combinations, pairwise
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import envs
+import play
+from envs.rendering import AGENTS, Canvas
+
+TINY = dict(num_envs=4, total_timesteps=1_200, learning_starts=200, train_frequency=20, batch_size=8, window=6,
+            hidden_size=16, eval_frequency=400, eval_episodes=3)  # fmt: skip
+
+
+def train(name, env_id, runs_dir, **changes):
+    """The folder of a tiny run; options that the script does not have are left out."""
+    script = importlib.import_module(name)
+    args = script.parse_args([f"--env={env_id}"])
+    options = {key: value for key, value in {**TINY, **changes}.items() if hasattr(args, key)}
+    return script.train(dataclasses.replace(args, seed=3, runs_dir=str(runs_dir), **options))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return train("avf_qplex", "wtd-s", tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Episodes of twelve steps."""
+    make = envs.make
+    monkeypatch.setattr(envs, "make", lambda env_id, num_envs=1: make(env_id, num_envs, horizon=12))
+
+
+def played(run, episodes=2, **options):
+    script, args, learner, _ = play.load_run(run, "best")
+    return play.watch(script, args, learner, episodes, seed=5, **options)
+
+
+SCRIPTED = (  # two robots on bp-10, what each starts next: four steps to a small box, the others last for one
+    [7, 7, 0, 5, 7],
+    [1, 6, 6, 7, 7],
+)
+
+
+@pytest.fixture
+def scripted():
+    """The recording of an episode of eight steps on environment 0, beside another one, and of what comes after it."""
+    recorder, pictures = play.Recorder(envs.make("bp-10", num_envs=2, horizon=8)), []
+    recorder.frames, todo, said = pictures, [list(actions) for actions in SCRIPTED], np.arange(2 * 2 * 8.0)
+    _, infos = recorder.reset(seed=0)
+    for step in range(12):
+        actions = np.full((2, 2), 7)
+        if step < 8:
+            actions[0] = [todo[agent].pop(0) if infos["macro_done"][0, agent] else 3 for agent in range(2)]
+        recorder.listen(None, None, (torch.tensor(said + step).reshape(2, 2, 8), None))
+        _, _, terminations, truncations, infos = recorder.step(actions)
+        if (over := terminations | truncations).any():
+            _, infos = recorder.reset(options={"reset_mask": over})
+    assert not any(todo)
+    return recorder.episode(), pictures
+
+
+# ---- recording ------------------------------------------------------------------------------------------------------
+def test_the_recording_of_a_scripted_episode_is_the_one_done_by_hand(scripted):
+    episode, pictures = scripted
+    assert episode.bars(0) == [(0, 1, 7), (1, 2, 7), (2, 6, 0), (6, 7, 5), (7, 8, 7)]
+    assert episode.bars(1) == [(0, 4, 1), (4, 5, 6), (5, 6, 6), (6, 7, 7), (7, 8, 7)]
+    assert episode.rows() == [0, 1, 2, 4, 5, 6, 7]
+    assert episode.running[3].tolist() == [0, 1] and episode.running[5].tolist() == [0, 6]
+    np.testing.assert_allclose(episode.rewards, np.full(8, -0.1))
+    assert episode.labels == [0, 1] and episode.names[0][7] == "Stay"
+    assert len(pictures) == 9 and all((one != other).any() for one, other in combinations(pictures, 2))
+    # of environment 0, of the network's run before each step
+    assert episode.utilities.shape == (8, 2, 8) and episode.utilities[5, 1].tolist() == (np.arange(16, 24) + 5).tolist()
+
+
+def test_the_recorder_changes_nothing_and_agrees_with_the_masks_of_the_environment():
+    plain, recorder = envs.make("wtd-t1", 3), play.Recorder(envs.make("wtd-t1", 3))
+    _, infos = plain.reset(seed=1)
+    recorder.reset(seed=1)
+    assert recorder.num_envs == 3 and recorder.n_actions == plain.n_actions
+    rng, chosen, running, rewards = np.random.default_rng(0), [], [], []
+    over = np.zeros(3, bool)
+    while not over[0]:
+        actions = rng.integers(plain.n_actions, size=(3, 4))
+        chosen.append(infos["macro_done"][0])
+        obs, reward, *over, infos = plain.step(actions)
+        over = over[0] | over[1]
+        np.testing.assert_array_equal(recorder.step(actions)[0], obs)
+        running.append(infos["macro_action"][0])
+        rewards.append(reward[0])
+    episode = recorder.episode()
+    np.testing.assert_array_equal(episode.chosen, chosen)
+    np.testing.assert_array_equal(episode.running, running)
+    np.testing.assert_array_equal(episode.rewards, rewards)
+    assert episode.utilities is None and episode.labels == [0, 1, 2, "A"]
+    for agent in range(4):
+        bars = episode.bars(agent)
+        assert bars[0][0] == 0 and bars[-1][1] == len(rewards)
+        assert all(one[1] == other[0] for one, other in pairwise(bars))
+        for start, end, action in bars:
+            assert chosen[start][agent] and not np.array(chosen)[start + 1 : end, agent].any()
+            assert (np.array(running)[start:end, agent] == action).all()
+
+
+def test_watching_gives_the_results_of_the_script_and_its_first_episode(run, brief):
+    script, args, learner, _ = play.load_run(run, "best")
+    expected = script.evaluate(learner["agents"], envs.make(args.env, 4), args.gamma, 5)
+    frames = []
+    result, episode = play.watch(script, args, learner, 4, 5, frames)
+    for key, value in expected.items():
+        np.testing.assert_allclose(result[key], value)
+    assert len(episode.rewards) == expected["length"][0] == len(frames) - 1
+    np.testing.assert_allclose(episode.rewards.sum(), expected["return"][0])
+    assert not learner["agents"]._forward_hooks
+
+
+def test_agents_choose_what_their_networks_find_best(run):
+    _, episode = played(run)
+    best = episode.utilities.argmax(2)
+    assert len(set(best[episode.chosen].tolist())) > 1 and episode.meaning == "utility"
+    np.testing.assert_array_equal(best[episode.chosen], episode.running[episode.chosen])
+    assert np.isneginf(episode.utilities[:, 0, 3:]).all(), "a robot has three macro-actions"
+
+
+# ---- the command line -----------------------------------------------------------------------------------------------
+def test_what_is_printed(run, brief, capsys, monkeypatch):
+    script, asked = importlib.import_module("avf_qplex"), []
+    evaluate = script.evaluate
+
+    def uneven(agents, env, gamma, seed):
+        asked.append((env.num_envs, gamma, seed))
+        return evaluate(agents, env, gamma, seed) | {"discounted_return": np.array([1.0, 2.0, 6.0])}
+
+    monkeypatch.setattr(script, "evaluate", uneven)
+    play.main([str(run), "--episodes=3", "--model=last"])
+    play.main([str(run), "--episodes=3", "--seed=5"])
+    gamma = play.load_run(run, "last")[1].gamma
+    assert asked == [(3, gamma, 3), (3, gamma, 5)], "the seed of the run, or the one given"
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "wtd-s avf_qplex last model of step 1200: 3 greedy episodes"
+    assert re.fullmatch(r"wtd-s avf_qplex best model of step (400|800|1200): 3 greedy episodes", lines[5])
+    assert [line.split("  ")[0] for line in lines[1:5]] == ["return", "discounted return", "length", "success"]
+    assert lines[2] == "discounted return     3.000 +- 1.528 (standard error)"
+    assert lines[3] == "length               12.000 +- 0.000 (standard error)"
+
+
+def test_the_files_that_are_written(run, tmp_path, brief, capsys):
+    gif, timeline, part = tmp_path / "team.GIF", tmp_path / "team.png", tmp_path / "part.png"
+    play.main([str(run), "--episodes=2", f"--gif={gif}", f"--timeline={timeline}"])
+    play.main([str(run), "--episodes=1", f"--timeline={part}", "--steps=0-12"])
+    with Image.open(gif) as animation, Image.open(timeline) as whole, Image.open(part) as enlarged:
+        assert animation.n_frames == 13 and animation.format == "GIF"
+        assert animation.size == Image.fromarray(envs.make("wtd-s")._draw(0)).size
+        assert whole.format == enlarged.format == "PNG"
+        assert whole.width == enlarged.width == 2 * play.WIDTH and whole.height < enlarged.height
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["part.png", "team.GIF", "team.png"]
+
+
+@pytest.mark.parametrize("name", play.SCRIPTS)
+def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
+    folder = train(name, "bp-10", tmp_path, total_timesteps=600)
+    play.main([str(folder), "--episodes=2", f"--timeline={tmp_path / 'team.png'}", "--steps=0-3"])
+    assert f"bp-10 {name} best model" in capsys.readouterr().out and (tmp_path / "team.png").exists()
+    _, episode = played(folder, 1)
+    if name == "cen_maddrqn":
+        assert episode.utilities is None
+    else:
+        np.testing.assert_array_equal(episode.utilities.argmax(2)[episode.chosen], episode.running[episode.chosen])
+    if name == "mac_iaicc":
+        assert episode.meaning == "probability"
+        np.testing.assert_allclose(episode.utilities.sum(2), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--episodes=0"], "--episodes must be at least 1, got 0"),
+        (["--episodes=many"], "argument --episodes: invalid int value: 'many'"),
+        (["--seed=-1"], "--seed must not be negative, got -1"),
+        (["--model=worst"], "invalid choice: 'worst'"),
+        (["--render"], "unrecognized arguments: --render"),
+        (["--steps=0-4"], "--steps needs --timeline"),
+        (["--timeline={}/team.png", "--steps=4"], "--steps must be two times, the second after the first"),
+        (["--timeline={}/team.png", "--steps=4-4"], "--steps must be two times, the second after the first"),
+        (["--timeline={}/team.png", "--steps=0-13"], "--steps 0-13 is out of range: the episode has 12 steps"),
+        (["--timeline={}/team.jpg"], "cannot write .*jpg: it has to be a .png file"),
+        (["--gif={}/missing/team.gif"], "cannot write .*missing/team.gif: it has to be a .gif file in a folder that"),
+    ],
+)
+def test_bad_options_end_with_one_line_and_leave_files_alone(run, tmp_path, brief, arguments, message):
+    for name in ("team.png", "team.jpg"):
+        (tmp_path / name).write_text("kept")
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(SystemExit, match=f"^play: .*{message}") as error:
+        play.main([str(run), "--episodes=1", *(argument.format(tmp_path) for argument in arguments)])
+    assert "\n" not in str(error.value)
+    assert sorted(tmp_path.iterdir()) == before and (tmp_path / "team.png").read_text() == "kept"
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "team.png"
+    path.write_text("kept")
+
+    def broken(self, file, kind, **options):
+        file.write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Image.Image, "save", broken)
+    with pytest.raises(SystemExit, match=r"^play: cannot write .*team.png: disk full"):
+        play.write(str(path), Image.new("RGB", (2, 2)), "PNG")
+    monkeypatch.undo()
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(SystemExit, match=r"^play: cannot write .*folder.png: "):
+        play.write(str(tmp_path / "folder.png"), Image.new("RGB", (2, 2)), "PNG")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["folder.png", "team.png"]
+    assert path.read_text() == "kept"
+
+
+def test_folders_that_are_no_runs_end_with_one_line(run, tmp_path):
+    def refused(folder, message):
+        with pytest.raises(SystemExit, match=f"^play: .*{message}") as error:
+            play.load_run(folder, "best")
+        assert "\n" not in str(error.value)
+
+    def settings(**changes):
+        (tmp_path / "args.json").write_text(json.dumps({**json.loads((run / "args.json").read_text()), **changes}))
+        return tmp_path
+
+    def model(**changes):
+        saved = torch.load(run / "best.pt", weights_only=True)
+        torch.save(saved | {"args": saved["args"] | changes}, tmp_path / "best.pt")
+        return settings()
+
+    refused(tmp_path / "missing", "there is no folder .*missing")
+    refused(run / "args.json", "there is no folder")
+    refused(tmp_path, "is not a run folder: args.json: ")
+    (tmp_path / "args.json").write_text("[1, 2]")
+    refused(tmp_path, "is not a run folder: args.json: ")
+    refused(settings(algorithm="os"), "is a run of 'os', which is none of avf_vdn avf_qmix")
+    refused(settings(), "best.pt")
+    (tmp_path / "best.pt").write_bytes(b"half")
+    refused(settings(), "best.pt")
+    refused(model(env="nowhere"), "nowhere")
+    refused(model(env="bp-10"), "best.pt does not fit its settings: ")
+    refused(model(hidden_size=32), "best.pt does not fit its settings: ")
+    assert play.load_run(model(device="cuda"), "best")[1].device == "cpu"
+    with pytest.raises(SystemExit, match=r"^play: .*last\.pt"):
+        play.load_run(tmp_path, "last")
+
+
+# ---- the timeline ---------------------------------------------------------------------------------------------------
+@pytest.fixture
+def spy(monkeypatch):
+    """What is drawn, in pixels of the whole picture: texts as (words, left, top, right, bottom), dots as (x, y)."""
+    texts, dots = [], []
+    text, dot = Canvas.text, play._draw_dot
+
+    def spy_text(self, x, y, words, size=14.0, fill=None, anchor="l", **options):
+        width, high = self.width(words, size) * self.unit, 0.72 * size * self.unit  # as high as capital letters
+        left = self.x + x * self.unit - {"l": 0, "m": width / 2, "r": width}[anchor]
+        middle = self.y + y * self.unit
+        if words != "":
+            texts.append((str(words), left, middle - high / 2, left + width, middle + high / 2))
+        text(self, x, y, words, size, *([fill] if fill else []), anchor=anchor, **options)
+
+    def spy_dot(canvas, x, y):
+        dots.append((canvas.x + x * canvas.unit, canvas.y + y * canvas.unit))
+        dot(canvas, x, y)
+
+    monkeypatch.setattr(Canvas, "text", spy_text)
+    monkeypatch.setattr(play, "_draw_dot", spy_dot)
+    return texts, dots
+
+
+def said(texts):
+    return [words for words, *_ in texts]
+
+
+def test_a_dot_and_a_name_for_each_macro_action_and_a_number_for_each_row(scripted, spy):
+    episode, (texts, dots) = scripted[0], spy
+    play.draw_timeline(episode, "title", "facts")
+    words, pitch = said(texts), (play.WIDTH - play.LEFT - play.RIGHT) / 8
+    lanes = sorted({y for _, y in dots})[-2:]  # the others are in the legend and in the example
+    for agent, lane in enumerate(lanes):
+        times = [(x / 4 - play.LEFT) / pitch for x, y in dots if y == lane]
+        np.testing.assert_allclose(times, [start for start, _, _ in episode.bars(agent)], atol=1e-6)
+    for name in ("Go-to-Small-Box(0) · 4", "Go-to-Small-Box(1) · 4", "Turn-left · 1", "Turn-right · 1"):
+        assert name in words
+    start = words.index("row")
+    assert words[start + 1 : start + 9] == ["0", "1", "2", "3", "4", "5", "6", "end"]
+    assert "mostly -0.1" in words and words[words.index("return so far") + 1] == "-0.8"
+
+
+def test_the_marked_row_says_who_chooses_and_who_is_ongoing(scripted, spy):
+    episode, (texts, _) = scripted[0], spy
+    assert play.example_row(episode, 0, 8) == 1
+    assert play.example_row(episode, 1, 8) == 2
+    assert play.example_row(episode, 5, 8) is None  # at 6 and 7 both choose
+    wide = np.zeros((20, 2), bool)
+    wide[[0, 4, 5, 11, 18], 0] = wide[[0, 18], 1] = True
+    assert play.example_row(episode._replace(chosen=wide), 0, 20) == 11, "far from other rows"
+    play.draw_timeline(episode, "title", "facts")
+    words = said(texts)
+    start = words.index("row 1, t = 1")
+    assert words[words.index("chosen now:", start) + 2] == "Stay"
+    assert words[words.index("running macro-actions of the ongoing agents, which have no dot:") + 2] == (
+        "Go-to-Small-Box(1)"
+    )
+    assert words.count("m") == 2  # in the explanation and on the one ongoing agent's bar
+    together = episode._replace(chosen=np.ones_like(episode.chosen))
+    play.draw_timeline(together, "title", "facts")
+    assert "Up to t = 8 all agents choose at every row: nobody is ongoing." in said(texts)
+
+
+def test_an_enlarged_part_shows_the_best_utilities_and_only_that_part(scripted, spy):
+    episode, (texts, dots) = scripted[0], spy
+    episode = episode._replace(utilities=np.tile(np.arange(8.0) / 4 - 1, (8, 2, 1)))
+    play.draw_timeline(episode, "title", "facts", steps=(3, 7))
+    words = said(texts)
+    lanes = sorted({y for _, y in dots})[-2:]
+    assert [sum(y == lane for _, y in dots) for lane in lanes] == [1, 3]
+    start = words.index("0.75") - 1
+    assert words[start : start + 6] == ["Stay", "0.75", "Turn-right", "0.50", "Turn-left", "0.25"]
+    assert "... Go-to-Small-Box(0) · 4" in words and "the 3 of highest utility" in words
+    assert not {"0.00", "-1.00", "end"} & set(words)
+    times = [float(word) for word in words[words.index("time t") + 1 :]]
+    assert times == [3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("env_id", ["bp-10", "wtd-s", "wtd-t1", "ct-10", "wtd-s-primitive"])
+@pytest.mark.parametrize("steps", [None, (0, 40), (3, 8)])
+def test_no_text_covers_another_or_leaves_the_picture(env_id, steps, spy):
+    recorder, rng, (texts, _) = play.Recorder(envs.make(env_id)), np.random.default_rng(1), spy
+    recorder.reset(seed=1)
+    while not recorder.over:
+        utilities = torch.tensor(rng.normal(0, 60, (recorder.n_agents, 1, max(recorder.n_actions))))
+        for agent, count in enumerate(recorder.n_actions):
+            utilities[agent, :, count:] = -torch.inf
+        recorder.listen(None, None, (utilities, None))
+        recorder.step(rng.integers(recorder.n_actions, size=(1, recorder.n_agents)))
+    episode = recorder.episode()
+    episode = episode._replace(rewards=rng.integers(-120, 120, len(episode.rewards)) / 10)
+    if steps:
+        steps = (steps[0], min(steps[1], len(episode.rewards)))
+    picture = play.draw_timeline(episode, f"{env_id} avf_qplex", "A greedy episode", steps)
+    height, width, _ = picture.shape
+    boxes = np.array([box for _, *box in texts])
+    assert (boxes[:, :2] >= 0).all() and (boxes[:, 2:] <= (2 * width, 2 * height)).all()
+    left, top, right, bottom = boxes.T
+    apart = (left[:, None] >= right) | (left >= right[:, None]) | (top[:, None] >= bottom) | (top >= bottom[:, None])
+    covered = [(texts[one][0], texts[other][0]) for one, other in np.argwhere(~apart) if one < other]
+    assert not covered
+
+
+def test_the_colours_are_those_of_the_rendering(scripted):
+    picture = play.draw_timeline(scripted[0], "title", "facts")
+    middle = picture.shape[0] - 2 * (play.FOOT + 14)
+    lanes = [picture[middle - 2 * play.LANE * (2 - agent) + 12] for agent in range(2)]  # in the upper part of the bars
+    for lane, (colour, _) in zip(lanes, AGENTS[:2], strict=True):
+        rgb = tuple(bytes.fromhex(colour[1:]))
+        assert (lane == rgb).all(1).mean() > 0.7
+
+
+def test_abbreviations_of_one_agents_macro_actions_differ():
+    for env_id in envs.IDS:
+        for names in envs.make(env_id).macro_action_names:
+            assert len({play.shorten(name) for name in names}) == len(names)
+    assert [play.shorten(name) for name in ("Pass-to-M(0)", "Go-TR", "Stay", "N")] == ["PtM(0)", "GTR", "St", "N"]
+
+
+def test_names_without_room_are_shortened_or_put_below_and_explained(scripted, spy):
+    """17 pixels a step: too few for a name of one step (those of one kind share a bracket) and, often, of three."""
+    episode, (texts, _) = scripted[0], spy
+    chosen, running = np.ones((50, 2), bool), np.full((50, 2), 4)
+    chosen[[10, 11, 13, 14], 1], running[9:12, 1], running[12:15, 1] = False, 0, 6
+    episode = episode._replace(chosen=chosen, running=running, rewards=np.zeros(50))
+    play.draw_timeline(episode, "title", "facts")
+    words = said(texts)
+    assert "Push x50" in words and "Push x9" in words and "Push x35" in words
+    assert not {"Push · 1", "Go-to-Small-Box(0) · 3", "Turn-right · 3"} & set(words)
+    assert "GtSB(0)" in words and "Tr" in words and words[-1] == "GtSB: Go-to-Small-Box · Tr: Turn-right"
