@@ -338,7 +338,7 @@ def train(args, stop=()):
         vars(buffer).update({key: value.numpy() for key, value in saved["buffer"].items()})
         obs, infos = env.load_state(saved["env"])
         rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
-        step, updates, recent, best = saved["progress"]
+        step, updates, recent, best = saved["counts"]
     else:
         folder.mkdir(parents=True)
         (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
@@ -405,9 +405,8 @@ def train(args, stop=()):
             arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
             parts = [part.state_dict() for part in (learner, target, optimizer)]
             memory = {key: torch.from_numpy(value) for key, value in vars(buffer).items()}
-            progress = step, updates, recent, best
             save(folder / "checkpoint.pt", args, parts=parts, buffer=memory, env=arrays, hidden=hidden,
-                 rng=rng.bit_generator.state, progress=progress)  # fmt: skip
+                 rng=rng.bit_generator.state, counts=(step, updates, recent, best))  # fmt: skip
             saved_at = time.time()
 
     bar.close()

@@ -180,8 +180,9 @@ def draw(ax, section, evaluations, kind):
         ax.plot(x, middle, color=colour, lw=1.7, marker=marker, ms=4.5, markevery=(i * every // n, every), label=label,
                 zorder=3 + n - i)  # fmt: skip
     if len(levels) == 2:  # early curves may go far down: half of the way from random to scripted below random will do
-        bottom, top = ax.get_ylim()
-        ax.set_ylim(max(bottom, levels["random"] - (levels["scripted"] - levels["random"]) / 2), top)
+        bottom = max(ax.get_ylim()[0], levels["random"] - (levels["scripted"] - levels["random"]) / 2)
+        top = max(np.max(line.get_ydata()) for line in ax.lines)
+        ax.set_ylim(bottom, top + 0.05 * (top - bottom))
     ax.set(xlim=0, xlabel="environment steps (thousands)")
     ax.grid(alpha=0.25, lw=0.6)
     ax.spines[["top", "right"]].set_visible(False)
@@ -197,6 +198,8 @@ def write_figure(path, rows, evaluations):
             if section:
                 draw(ax, section, evaluations, kind)
                 legend |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+            else:
+                ax.set(xticks=[], yticks=[], xlabel="no runs")
         part.axes[0].set_ylabel("return of greedy episodes")
     names = sorted(legend, key=lambda name: legend[name].get_color() == GREY)  # the algorithms first
     columns = max(1, int(11 * figure.get_figwidth()) // (max(map(len, names)) + 9))  # as many as fit side by side
@@ -289,13 +292,13 @@ def over_tasks(sections):
             scaled.setdefault(label, []).append(((of["return"] - low) / (high - low)).to_numpy())
         for kind, x in known.items():
             cells.setdefault(f"*{kind} policy*", {})[env] = f"{x['return']:.{section.digits}f}"
-    everywhere = {name: samples for name, samples in scaled.items() if len(samples) == len(sections)}
+    everywhere = {name: samples for name, samples in scaled.items() if len(samples) == len(sections) > 1}
     for name, samples in everywhere.items():
         cells[name]["all, scaled"] = with_interval(samples, iqm, 3)
-    columns = [*sections, "all, scaled"]
+    columns = [*sections, *(["all, scaled"] if everywhere else [])]
     cells = {name: cells[name] for name in sorted(cells, key=lambda name: name[0] == "*")}  # the references last
     text = table(["", *columns], [[name, *(of.get(column, "") for column in columns)] for name, of in cells.items()])
-    return text + "Over all tasks (of algorithms that have runs on each):\n\n" + comparison_table(everywhere)
+    return text + (f"Over all tasks:\n\n{comparison_table(everywhere)}" if everywhere else "")
 
 
 def sources(runs):
@@ -312,15 +315,15 @@ def markdown(sections, runs, notes, figures):
 Returns of greedy policies. A run's final performance is the mean of its last {LAST} evaluations; a row is over its
 runs, one for each seed. SE: standard error. IQM: interquartile mean, a quarter of the runs, rounded down, left out at
 either end, with the 95% interval of {RESAMPLES:,} bootstrap resamples, stratified by task. Solved: runs with
-{SOLVED:.0%} of the optimal return or more in each of these {LAST} evaluations, with the exact 95% interval of Clopper and
-Pearson. P(row > column): the probability that a run of the row ends above one of the column; ties count half. Scaled:
-the random policy has 0 and the scripted policy 1. The paper says neither whether its returns are discounted nor what its
-± is. Time per run is wall-clock, beside whatever else the machine did.
+{SOLVED:.0%} of the optimal return or more in each of these {LAST} evaluations, with the exact 95% interval of Clopper
+and Pearson. P(row > column): the probability that a run of the row ends above one of the column; ties count half.
+Scaled: the random policy has 0 and the scripted policy 1. The paper says neither whether its returns are discounted
+nor what its ± is. Time per run is wall-clock, beside whatever else the machine did.
 
 """
     if runs.groupby(["env", "algorithm", "variant"]).size().min() < 10:
-        text += "**Few seeds.** Bootstrap intervals of less than ten runs know nothing of outcomes that none of the runs\n"
-        text += "had, and tend to be too narrow.\n\n"
+        text += "**Few seeds.** Bootstrap intervals of less than ten runs know nothing of outcomes that none of the\n"
+        text += "runs had, and tend to be too narrow.\n\n"
     text += "".join(f"![{name}]({name}.png)\n\n" for name in figures)
     text += f"IQM of the final returns [95%]:\n\n{over_tasks(first_sections(sections))}"
     for section in sections:

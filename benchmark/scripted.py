@@ -46,6 +46,11 @@ LOADS = {
 }
 
 
+def fail(message):
+    """Ends the program with one line."""
+    raise SystemExit(f"scripted: {message}")
+
+
 def random_policy(env, infos, rng):
     """Every free agent picks a macro-action uniformly at random."""
     return rng.integers(env.n_actions, size=(env.num_envs, env.n_agents))
@@ -132,7 +137,7 @@ def script_of(env_id):
 
 
 def play(env_id, policy, episodes, seed, gamma):
-    """Plays episodes side by side: a dict of float64 [episodes]: return, discounted_return, length, success (0 or 1)."""
+    """Plays episodes side by side: a dict of return, discounted_return, length and success, float64 [episodes] each."""
     env, rng = envs.make(env_id, episodes), np.random.default_rng(seed)
     _, infos = env.reset(seed=seed)
     result = {key: np.zeros(episodes) for key in ("return", "discounted_return", "length", "success")}
@@ -158,12 +163,13 @@ def reference(env_id, policy, episodes, seed=0):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.error = fail
     parser.add_argument("--envs", nargs="+", default=envs.IDS, choices=envs.IDS, metavar="ID", help="tasks (all)")
     parser.add_argument("--episodes", type=int, default=2000, help="of each policy on each task (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, help="JSON file to write, with the tasks that were played")
     args = parser.parse_args(argv)
     if args.episodes < 2:
-        parser.error("--episodes must be at least 2")
+        fail("--episodes must be at least 2")
     references = {}
     print(f"{'task':16} {'policy':26} {'return':>9} {'+- SE':>7} {'discounted':>10} {'length':>7} success")
     for env_id in args.envs:
@@ -179,7 +185,7 @@ def main(argv=None):
         try:
             args.output.write_text(json.dumps(references, indent=1) + "\n")
         except OSError as error:
-            parser.error(f"cannot write {args.output}: {error.strerror}")
+            fail(f"cannot write {args.output}: {error.strerror}")
 
 
 if __name__ == "__main__":

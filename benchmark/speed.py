@@ -1,7 +1,7 @@
 """How fast environments and scripts are on this machine, and whether a change made them slower.
 
-    python benchmark/speed.py -o before.json               a table, and a file of it
-    python benchmark/speed.py --compare before.json        the table with ratios; exit code 1 beyond --tolerance
+    python benchmark/speed.py -o before.csv               a table, and a file of it
+    python benchmark/speed.py --compare before.csv        the table with ratios; exit code 1 beyond --tolerance
     python benchmark/speed.py --against ../other-checkout  update and train of the scripts here and there, in turn
 
     env      a step of one environment with random macro-actions, drawn before; resets included
@@ -13,12 +13,10 @@
 Times are CPU seconds of one thread, so programs beside it that want the processor do not count; the fastest of several
 rounds counts. A file has them as multiples of a fixed reference workload that was measured in turn with them, because a
 processor that is slower for the moment changes both. Training is measured through the command line, so the other
-checkout may be of any age.
+checkout may be of any age; what takes little of a run, such as the updates of Mac-IAICC, needs more --steps.
 """
 
 import argparse
-import importlib
-import json
 import os
 import resource
 import subprocess
@@ -28,6 +26,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, Python looks in this folder only
@@ -38,6 +37,7 @@ from benchmark import record
 TRAINED = ("wtd-s", "bp-10", "ct-10")
 BATCHES = (1, 32, 256)
 CALLS = 200
+SHORT = 5  # times as many rounds as of training runs: noise weighs more on what takes a fraction of a second
 
 
 def fail(message):
@@ -109,7 +109,7 @@ def train(checkout, name, flags):
 
 def training(checkouts, name, env_id, steps, rounds):
     """Seconds of an update and of a step of training, {measure: float64 [rounds, checkouts]}, and the reference's."""
-    args = importlib.import_module(name).parse_args([f"--env={env_id}"])
+    args = record.load_script(name).parse_args([f"--env={env_id}"])
     common = {"env": env_id, "total-timesteps": steps, "eval-frequency": 10**9, "eval-episodes": 1,
               "checkpoint-frequency": 10**9}  # fmt: skip
     if hasattr(args, "train_frequency"):
@@ -131,7 +131,7 @@ def measure(names, env_ids, steps, rounds):
     """Yields (name of a measure, seconds each, the same in reference workloads) of all that is asked for."""
 
     def short(name, function, env):
-        pairs = [(cpu_seconds(reference_workload), cpu_seconds(function)) for _ in range(5 * rounds)]
+        pairs = [(cpu_seconds(reference_workload), cpu_seconds(function)) for _ in range(SHORT * rounds)]
         reference, seconds = np.min(pairs, axis=0)
         seconds /= CALLS * env.num_envs
         return f"{name} x {env.num_envs}", seconds, seconds / reference
@@ -141,7 +141,7 @@ def measure(names, env_ids, steps, rounds):
             yield short(f"env {env_id}", *stepping(env_id, num_envs))
     for name in names:
         for env_id in env_ids or TRAINED:
-            yield short(f"act {name} {env_id}", *acting(importlib.import_module(name), env_id))
+            yield short(f"act {name} {env_id}", *acting(record.load_script(name), env_id))
             found, reference = training([record.ROOT], name, env_id, steps, rounds)
             for kind, seconds in found.items():
                 yield f"{kind} {name} {env_id}", seconds.min(), seconds.min() / reference.min()
@@ -178,27 +178,28 @@ def main(argv=None):
         if not args.against.is_dir():
             fail(f"--against {args.against} is no folder")
         return compare_checkouts(args.against.resolve(), *selected)
-    before = {}
+    before = pd.Series(dtype=float)
     if args.compare:
         try:
-            before = json.loads(args.compare.read_text())
-            if before.pop("steps") != args.steps:
-                fail(f"{args.compare} was measured with other --steps")
-            before = {name: float(relative) for name, (_, relative) in before.items()}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            fail(f"{args.compare} is not such a file: {error!r}")
+            table = pd.read_csv(args.compare, index_col="measure")
+            before, steps = table["relative"].astype(float), set(table["steps"])
+        except (OSError, ValueError, KeyError) as error:
+            fail(f"{args.compare} is not such a file: {error}")
+        if steps != {args.steps}:
+            fail(f"{args.compare} was measured with other --steps")
     torch.set_num_threads(1)
-    measures, slower = {"steps": args.steps}, []
-    print(f"{'measure':34} {'per second':>11} {'ms each':>10}{'  time : before' * bool(before)}")
+    rows, slower = [], []
+    print(f"{'measure':34} {'per second':>11} {'ms each':>10} {'now / before':>13}")
     for name, seconds, relative in measure(*selected):
-        measures[name], ratio = (seconds, relative), relative / before.get(name, np.nan)
-        print(f"{name:34} {1 / seconds:11,.0f} {1000 * seconds:10.4f}" + f"  {ratio:13.2f}" * bool(before), flush=True)
+        rows.append({"measure": name, "seconds": seconds, "relative": relative, "steps": args.steps})
+        ratio = relative / before.get(name, np.nan)
+        print(f"{name:34} {1 / seconds:11,.0f} {1000 * seconds:10.4f} {ratio:13.2f}", flush=True)
         slower += [name] if ratio > args.tolerance else []
     if args.output:
         try:
-            args.output.write_text(json.dumps(measures, indent=1) + "\n")
+            pd.DataFrame(rows).to_csv(args.output, index=False)
         except OSError as error:
-            fail(f"cannot write {args.output}: {error.strerror}")
+            fail(f"cannot write {args.output}: {error}")
     if slower:
         raise SystemExit(f"more than {args.tolerance} times as long: {', '.join(slower)}")
 

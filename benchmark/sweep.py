@@ -6,7 +6,7 @@
 What follows -- goes to every script. Finished runs are skipped, others go on from their checkpoint, a crashed one is
 tried once more. Ctrl-C, SIGTERM and, on Linux, even the death of this program make the scripts write a checkpoint and
 end; the same command goes on where it stopped. A run is the same if algorithm, task, flags, seed and code are the same
-(record.py); runs that were started by hand are left alone.
+(record.py); runs that were started by hand are left alone. Needs the extra `report`.
 
 With --record finished runs are added to runs.csv and evaluations.csv, in benchmark/results or a folder of your own, and
 what is in there is skipped, even where its run folder is gone: so a large grid is made in several sittings.
@@ -19,7 +19,6 @@ While a process works on a run, its log in <runs-dir>/logs is locked (flock), so
 
 import argparse
 import fcntl
-import importlib
 import itertools
 import json
 import os
@@ -112,9 +111,8 @@ def run_job(job):
     started, attempts, code, error, folder = time.time(), 0, None, "", None
 
     def ended(result):
-        spent = timedelta(seconds=round(time.time() - started))
-        unsolved = error if result == "failed" else ""
-        return job | dict(result=result, folder=folder or "-", attempts=attempts, time=str(spent), error=unsolved)
+        spent = str(timedelta(seconds=round(time.time() - started)))
+        return job | dict(result=result, folder=folder or "-", attempts=attempts, time=spent, error=error)
 
     with open(log_path(job), "a") as log:
         # The script inherits the lock with its output: the run is free when the script has ended, too.
@@ -173,7 +171,7 @@ def run_script(job, folder, log):
                 process.send_signal(number)
                 passed += 1
             for made in set(run_folders(job)) - before:  # by this script, or by one with other flags beside it
-                if json.loads((made / "args.json").read_text()) == job["arguments"]:
+                if job["arguments"].items() <= json.loads((made / "args.json").read_text()).items():
                     record.replace_text(made / record.ORIGIN, json.dumps(origin, indent=2) + "\n")
                 before.add(made)
             time.sleep(0.1)
@@ -226,8 +224,8 @@ def run_jobs(jobs, args):
                 except Exception as error:  # the engine's own: an unwritable log, or workers lost once too often
                     job |= {"result": "stopped" if stop else "failed", "error": repr(error).strip().splitlines()[-1]}
                 results.append(job)
-                line = f"[{len(results)}/{len(jobs)}] {name(job)}: {job['result']}, {job['time']}"
-                tqdm.write(f"{line}, greedy return {job['return']}", sys.stderr)
+                place = f"[{len(results)}/{len(jobs)}] {name(job)}"
+                tqdm.write(f"{place}: {job['result']}, {job['time']}, greedy return {job['return']}", sys.stderr)
                 bar.update()
             if len(stop) > interrupted:
                 interrupted = len(stop)
@@ -242,8 +240,9 @@ def run_jobs(jobs, args):
 def table(results):
     """Results as a table, and below it a line for each failure."""
     columns = ["algorithm", "env", "seed", "result", "return", "time", "attempts", "folder"]
-    failed = [f"{name(job)} failed: {job['error']} (log: {log_path(job)})" for job in results if job["error"]]
-    return "\n".join([pd.DataFrame(results)[columns].to_string(index=False), *failed])
+    failed = [job for job in results if job["result"] == "failed"]
+    lines = [f"{name(job)} failed: {job['error']} (log: {log_path(job)})" for job in failed]
+    return "\n".join([pd.DataFrame(results)[columns].to_string(index=False), *lines])
 
 
 def parse_seeds(text):
@@ -261,15 +260,15 @@ def make_jobs(args, options):
     """The jobs of a sweep. Bad flags behind -- end the program, bad values of them in the words of the script."""
     cells = []
     for algorithm, env in dict.fromkeys((algorithm, env) for algorithm in args.algos for env in args.envs):
-        usual = record.defaults(algorithm, env) | {"runs_dir": args.runs_dir}
-        own = [f"--{name.replace('_', '-')}={usual[name]}" for name in ("env", "seed", "runs_dir")]
+        usual = {"env": env, "seed": 2**31 - 1, "runs_dir": args.runs_dir}  # a seed that differs from any behind --
+        own = [f"--{name.replace('_', '-')}={value}" for name, value in usual.items()]
         try:
-            arguments = asdict(importlib.import_module(algorithm).parse_args([*own, *options]))
+            arguments = asdict(record.load_script(algorithm).parse_args([*own, *options]))
         except SystemExit as stopped:
             if stopped.code == 2:  # the parser has told what it does not know, but not whose it is
                 fail(f"{algorithm} does not take {shlex.join(options)}")
             raise
-        if any(arguments[name] != usual[name] for name in ("env", "seed", "runs_dir")):
+        if not usual.items() <= arguments.items():
             fail("--env, --seed and --runs-dir cannot stand behind --, the sweep sets them")
         cells.append((algorithm, env, record.flags_of(algorithm, arguments), record.checksum(algorithm), arguments))
     jobs = []  # all of the first seed before the second, so that a sweep of days soon shows something of everything
