@@ -1,0 +1,160 @@
+"""What is kept of runs: a row for each in runs.csv and its evaluations in evaluations.csv, both plain text.
+
+KEY says which run it is. flags: those that differ from the script's defaults for the task, as "name=value name=value".
+checksum: of the script and of envs/*.py, because changed code makes another run. A script cannot tell its own checksum,
+so the sweep leaves ORIGIN in the run folder; of a run that was started by hand it is not known, and empty.
+"""
+
+import fcntl
+import hashlib
+import importlib
+import itertools
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pandas as pd
+from tensorboard.backend.event_processing.event_file_loader import LegacyEventFileLoader
+from tensorboard.compat.proto.event_pb2 import SessionLog
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmark" / "results"
+ORIGIN = "origin.json"
+KEY = ["algorithm", "env", "flags", "seed", "checksum"]
+VALUES = ["return", "discounted_return", "length", "success"]
+RUNS = "algorithm env variant seed flags commit checksum steps seconds processor date".split()
+TABLES = {"runs.csv": RUNS, "evaluations.csv": [*KEY, "step", *VALUES]}
+
+
+def scripts():
+    """Names of the algorithm scripts."""
+    return sorted(path.stem for path in ROOT.glob("*.py") if "\nALGORITHM = " in path.read_text())
+
+
+def load_script(algorithm):
+    """The module of a script."""
+    if str(ROOT) not in sys.path:
+        sys.path.insert(0, str(ROOT))
+    return importlib.import_module(algorithm)
+
+
+def flags_of(algorithm, arguments):
+    """The flags that make a script's arguments, a dict, of its defaults; without what has a column of its own."""
+    usual = asdict(load_script(algorithm).parse_args([f"--env={arguments['env']}"]))
+    usual |= {name: arguments.get(name) for name in ("algorithm", "seed", "runs_dir")}
+    return " ".join(f"{name}={value}" for name, value in arguments.items() if usual.get(name, ...) != value)
+
+
+def checksum(algorithm):
+    """Of all the code of this repository that a run of the script executes."""
+    code = [ROOT / f"{algorithm}.py", *sorted((ROOT / "envs").glob("*.py"))]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest()[:12]
+
+
+def commit():
+    """The commit that is checked out, with a + if tracked files were changed since; "" outside git."""
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--exclude=*", "--dirty=+"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def processor():
+    """The name of this machine's processor."""
+    try:
+        return re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())[1]
+    except (OSError, TypeError):  # not Linux, or a processor without a name there
+        return platform.processor()
+
+
+def replace_text(path, text):
+    """Writes a file so that a kill at any moment leaves the old one or the new one."""
+    Path(f"{path}.new").write_text(text)
+    os.replace(f"{path}.new", path)
+
+
+def describe(folder):
+    """What run a folder is of: {column: value} of runs.csv, without steps, seconds and date."""
+    arguments = json.loads((folder / "args.json").read_text())
+    about = {name: str(arguments[name]) for name in ("algorithm", "env", "seed")}
+    if (folder / ORIGIN).exists():
+        return about | json.loads((folder / ORIGIN).read_text())
+    flags = flags_of(about["algorithm"], arguments)
+    return about | {"flags": flags, "variant": flags, "checksum": "", "commit": "", "processor": ""}
+
+
+def read_events(folder):
+    """What a run logged: its evaluations, {step: {name: text}}, the seconds that it ran and when it began."""
+    files = [list(LegacyEventFileLoader(str(path)).Load()) for path in folder.glob("events.out.tfevents.*")]
+    files = sorted((events for events in files if events), key=lambda events: events[0].wall_time)
+    points = {}
+    for event in itertools.chain.from_iterable(files):
+        if event.session_log.status == SessionLog.START:  # of a resumed run: from this step on replaces what was before
+            points = {step: values for step, values in points.items() if step < event.step}
+        for value in event.summary.value:
+            if (name := value.tag.removeprefix("eval/")) in VALUES:
+                points.setdefault(event.step, {})[name] = f"{value.simple_value:.7g}"  # the digits of a float32
+    seconds = sum(max(event.wall_time for event in events) - events[0].wall_time for events in files)
+    return points, seconds, files[0][0].wall_time if files else 0.0
+
+
+def is_finished(folder):
+    """Whether a run has come to its end: the last evaluation is made, and the checkpoint is removed after all else."""
+    steps = json.loads((folder / "args.json").read_text())["total_timesteps"]
+    return not (folder / "checkpoint.pt").exists() and max(read_events(folder)[0], default=0) >= steps
+
+
+def read_folder(folder):
+    """A run as it is kept: its row of runs.csv, a dict, and its rows of evaluations.csv, a DataFrame."""
+    points, seconds, began = read_events(folder)
+    run = describe(folder) | {"steps": str(max(points, default=0)), "seconds": f"{seconds:.0f}"}
+    run["date"] = datetime.fromtimestamp(began, UTC).strftime("%F %T")
+    rows = [{**run, "step": str(step), **points[step]} for step in sorted(points)]
+    return run, pd.DataFrame(rows, columns=TABLES["evaluations.csv"]).fillna("")
+
+
+def load(place):
+    """The runs and the evaluations recorded in a folder: two DataFrames of text, empty where there is no file."""
+    tables = []
+    for name, columns in TABLES.items():
+        table = pd.DataFrame(columns=columns, dtype=str)
+        if (place / name).exists():
+            table = pd.read_csv(place / name, dtype=str, keep_default_na=False)
+        if missing := set(columns) - set(table):
+            raise ValueError(f"{place / name} has no column {' '.join(sorted(missing))}")
+        tables.append(table[columns])
+    return tables
+
+
+def load_runs(place):
+    """What `read_folder` returned of each run that is recorded in a folder."""
+    runs, evaluations = load(place)
+    found = dict(list(evaluations.groupby(KEY)))
+    return [(run, found[key]) for run in runs.to_dict("records") if (key := tuple(run[k] for k in KEY)) in found]
+
+
+def add(place, run, evaluations):
+    """Records what `read_folder` returned, whole or not at all; any number of processes may do so at once.
+
+    Raises:
+        OSError, ValueError: the folder cannot be written; its files are other tables.
+    """
+    place.mkdir(parents=True, exist_ok=True)
+    lock = os.open(place, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        runs, old = load(place)
+        # runs.csv comes second: a run that is not in it counts as not recorded, and is replaced the next time
+        for name, table, new in (("evaluations.csv", old, evaluations), ("runs.csv", runs, pd.DataFrame([run]))):
+            same = (table[KEY] == [run[key] for key in KEY]).all(axis=1)
+            table = pd.concat([table[~same], new])[TABLES[name]]
+            replace_text(place / name, table.to_csv(index=False, lineterminator="\n"))
+    finally:
+        os.close(lock)
