@@ -115,9 +115,8 @@ class Team(nn.Module):
         self.parts = np.indices(n_actions).reshape(len(n_actions), -1).T  # [J, n], each agent's macro-action
         bound, columns = hidden_size**-0.5, np.arange(max(n_actions))
         one_hot = torch.tensor(self.parts[..., None] == columns, dtype=torch.float32)  # [J, n, A]
-        self.register_buffer(
-            "one_hot", nn.functional.pad(one_hot, (0, 0, 0, 0, 0, 1)), persistent=False
-        )  # zeros for -1
+        one_hot = nn.functional.pad(one_hot, (0, 0, 0, 0, 0, 1))  # [J + 1, n, A], zeros for -1
+        self.register_buffer("one_hot", one_hot, persistent=False)
         self.encoder = AgentLinear(1, len(n_actions) * (obs_size + 1 + len(columns)), hidden_size)
         self.gru_input = AgentLinear(1, hidden_size, 3 * hidden_size)
         self.gru_hidden = nn.Parameter(torch.empty(1, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
