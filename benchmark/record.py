@@ -2,7 +2,7 @@
 
 KEY says which run it is. flags: those that differ from the script's defaults for the task, as "name=value name=value".
 checksum: of the script and of envs/*.py, because changed code makes another run. A script cannot tell its own checksum,
-so the sweep leaves ORIGIN in the run folder; of a run that was started by hand it is not known, and empty.
+so the sweep leaves ORIGIN beside its run folders; of a run that was started by hand it is not known, and empty.
 """
 
 import fcntl
@@ -84,8 +84,8 @@ def describe(folder):
     """What run a folder is of: {column: value} of runs.csv, without steps, seconds and date."""
     arguments = json.loads((folder / "args.json").read_text())
     about = {name: str(arguments[name]) for name in ("algorithm", "env", "seed")}
-    if (folder / ORIGIN).exists():
-        return about | json.loads((folder / ORIGIN).read_text())
+    if (folder.parent / ORIGIN).exists():
+        return about | json.loads((folder.parent / ORIGIN).read_text())
     flags = flags_of(about["algorithm"], arguments)
     return about | {"flags": flags, "variant": flags, "checksum": "", "commit": "", "processor": ""}
 
@@ -141,15 +141,11 @@ def load_runs(place):
 
 
 def add(place, run, evaluations):
-    """Records what `read_folder` returned, whole or not at all; any number of processes may do so at once.
-
-    Raises:
-        OSError, ValueError: the folder cannot be written; its files are other tables.
-    """
+    """Records what `read_folder` returned, whole or not at all; any number of processes may do so at once."""
     place.mkdir(parents=True, exist_ok=True)
     lock = os.open(place, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
         runs, old = load(place)
         # runs.csv comes second: a run that is not in it counts as not recorded, and is replaced the next time
         for name, table, new in (("evaluations.csv", old, evaluations), ("runs.csv", runs, pd.DataFrame([run]))):

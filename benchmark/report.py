@@ -3,16 +3,16 @@
     python benchmark/report.py                    of benchmark/results, into it
     python benchmark/report.py runs -o report     of run folders
 
-RUNS are folders with a runs.csv (see record.py), run folders, or folders of them. Only finished runs count; a report of
-half a grid is a report of that half. Algorithms with the same variant are compared, and the variants of an algorithm.
+RUNS are folders with a runs.csv (see record.py), run folders, or folders of them. Only finished runs count. Algorithms
+with the same variant are compared, and the variants of an algorithm.
 """
 
 import argparse
+import itertools
 import json
 import re
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -44,34 +44,8 @@ ALGORITHMS = {
 OTHERS = [("#332288", "X"), ("#882255", "*"), ("#999933", "p"), ("#44AA99", "h"), ("#661100", "<"), ("#777777", ">")]
 GREY = "#444444"
 
-# The figures of the paper, as rows of tasks: each is made when there are runs of every row
-FIGURES = {"figure-4": [["bp-10", "bp-20", "bp-30"], ["wtd-s", "wtd-d", "wtd-t", "wtd-t1"]]}
-
-# The paper's numbers and what stands behind their +- (Tables 1 and 3); its figures give none. On primitive tasks, where
-# every macro-action lasts a step, avf_*.py is the primitive algorithm.
-PAPER = {
-    "ct-10": dict(dec_maddrqn=(0.05, 0.02), cen_maddrqn=(0.35, 0.09), avf_vdn=(0.13, 0.05), avf_qmix=(0.26, 0.08),
-                  avf_qplex=(0.61, 0.09), mac_iaicc=(0.29, 0.06)),
-    "bp-10-primitive": dict(avf_vdn=(-4.1, 10.5), avf_qmix=(-2.0, 9.3), avf_qplex=(13.4, 2.6)),
-    "wtd-s-primitive": dict(avf_vdn=(32, 4.5), avf_qmix=(44, 6.2), avf_qplex=(61, 5.3)),
-    "ct-10-primitive": dict(avf_vdn=(0.04, 0.01), avf_qmix=(0.09, 0.03), avf_qplex=(0.20, 0.04)),
-}  # fmt: skip
-
-
-class Section(NamedTuple):
-    """What a figure and its tables compare: runs on a task, as from `read_runs`, by their column `label`."""
-
-    title: str
-    env: str
-    runs: pd.DataFrame
-
-    @property
-    def groups(self):
-        return self.runs.groupby("label", sort=False)
-
-    @property
-    def digits(self):
-        return 3 if self.runs["return"].abs().max() < 2 else 1
+# As rows of tasks; made when there are runs of every row
+FIGURE_4 = [["bp-10", "bp-20", "bp-30"], ["wtd-s", "wtd-d", "wtd-t", "wtd-t1"]]
 
 
 def fail(message):
@@ -87,32 +61,29 @@ def iqm(*samples, axis=-1):
 def improvement(*samples, axis=-1):
     """P(X > Y) of Agarwal et al. 2021: the mean over tasks of the share of pairs of runs with x > y, ties count half.
 
-    samples: x and y of the first task, of the second and so on, float [..., runs].
+    samples: x of each task, then y of each task, float [..., runs].
     """
-    pairs = zip(samples[::2], samples[1::2], strict=True)
+    pairs = zip(samples[: len(samples) // 2], samples[len(samples) // 2 :], strict=True)
     return np.mean([(np.sign(x[..., :, None] - y[..., None, :]) / 2 + 0.5).mean((-2, -1)) for x, y in pairs], axis=0)
 
 
 def interval(samples, statistic):
-    """The ends of a statistic's 95% percentile interval, runs being redrawn within each sample; nan for single runs.
-
-    samples: float arrays [..., runs]. The same samples give the same interval.
-    """
+    """The ends of a statistic's 95% percentile interval, runs being redrawn within each sample, float [..., runs]."""
     if min(x.shape[-1] for x in samples) < 2:
         return np.full((2, *samples[0].shape[:-1]), np.nan)
     options = dict(n_resamples=RESAMPLES, vectorized=True, axis=-1, method="percentile", rng=0)
     return np.stack(stats.bootstrap(samples, statistic, **options).confidence_interval)
 
 
-def read_runs(paths, warn):
-    """Runs and evaluations of the paths: two DataFrames; the column `run` of the second is the index of the first.
+def read_runs(paths):
+    """Two DataFrames, runs and evaluations (`run` is the index of the first), and notes on runs that are left out.
 
-    To the columns of runs.csv come the final performance, under the names of VALUES, and whether the run is `solved`.
+    The columns of VALUES are a run's final performance; `scaled` is 0 for the random policy and 1 for the scripted.
     """
-    found = []
+    found, notes = [], []
     for path in map(Path, paths):
         try:
-            recorded = list(record.load_runs(path))
+            recorded = record.load_runs(path)
         except (OSError, ValueError) as error:
             fail(f"cannot read {path}: {error}")
         folders = sorted(file.parent for file in path.rglob("args.json"))
@@ -125,118 +96,116 @@ def read_runs(paths, warn):
                     raise ValueError("not finished")
                 found.append(record.read_folder(folder))
             except (OSError, ValueError, KeyError, TypeError, ImportError, SystemExit) as error:
-                warn(f"{folder.name}: left out, {error}")
+                notes.append(f"{folder.name}: left out, {error}")
     if not found:
         fail("no finished run found")
-    runs = pd.DataFrame([run for run, _ in found])
+    runs = pd.DataFrame([run for run, _ in found]).astype({"seed": int, "seconds": float})
     evaluations = pd.concat([values.assign(run=i) for i, (_, values) in enumerate(found)])
     evaluations = evaluations[["run", "step", *record.VALUES]].apply(pd.to_numeric)
-    runs[["seed", "seconds"]] = runs[["seed", "seconds"]].apply(pd.to_numeric)
     last = evaluations.sort_values("step").groupby("run").tail(LAST).groupby("run")
     runs = runs.join(last[record.VALUES].mean().round(6)).join(last["step"].max())  # rounded: ties stay ties
-    scripted = [REFERENCES.get(env, {}).get("scripted", {}) for env in runs["env"]]
-    runs["optimum"] = [x["return"] if x.get("optimal") else np.nan for x in scripted]
-    runs["solved"] = last["return"].min() >= SOLVED * runs["optimum"]
-    same, order = ["env", "algorithm", "variant", "seed"], [*envs.IDS, *ALGORITHMS]
+    levels = pd.DataFrame([{kind: x["return"] for kind, x in REFERENCES[env].items()} for env in runs["env"]])
+    runs["scaled"] = (runs["return"] - levels["random"]) / (levels["scripted"] - levels["random"])
+    runs["solved"] = last["return"].min() >= SOLVED * levels["scripted"]
+    same = ["env", "algorithm", "variant", "seed"]
     newest = runs.sort_values("date", kind="stable").drop_duplicates(same, keep="last")
-    for _, run in runs.drop(newest.index).iterrows():
-        warn(f"{run['algorithm']} on {run['env']}, seed {run['seed']} of {run['date']}: left out, there is a newer one")
-    return newest.sort_values(
-        same, key=lambda x: x.map(lambda y: (order.index(y), "") if y in order else (99, y))
-    ), evaluations
+    for run in runs.drop(newest.index).itertuples():
+        notes.append(f"{run.algorithm} on {run.env}, seed {run.seed} of {run.date}: left out, there is a newer one")
+    rank = {name: (i, "") for i, name in enumerate([*envs.IDS, *ALGORITHMS])}
+    return newest.sort_values(same, key=lambda x: x.map(lambda name: rank.get(name, (99, name)))), evaluations, notes
 
 
 def make_sections(runs):
-    """The sections of a report: on each task the algorithms by variant, then the variants of those that have some."""
+    """The runs that a figure and its tables compare, by the columns `section`, its title, and `label`.
+
+    On each task first the algorithms by variant, then the variants of those that have some.
+    """
     names = runs["algorithm"].map(lambda name: ALGORITHMS.get(name, (name,))[0])
-    for env, on_task in runs.groupby("env", sort=False):
-        variants = on_task.groupby("algorithm")["variant"].transform("nunique")
-        for variant, alike in on_task.groupby("variant"):
-            if alike["algorithm"].nunique() > 1 or variants[alike.index].min() == 1:
-                yield Section(f"{env}: {variant}" if variant else env, env, alike.assign(label=names))
-        for name, of in on_task[variants > 1].groupby(names, sort=False):
-            labels = of["variant"].where(of["variant"] != "", name)
-            yield Section(f"{env}: variants of {name}", env, of.assign(label=labels))
+    variants = runs.groupby(["env", "algorithm"])["variant"].transform("nunique")
+    alike = runs.assign(section=(runs["env"] + ": " + runs["variant"]).str.removesuffix(": "), label=names)
+    alike = alike[(alike.groupby("section")["algorithm"].transform("nunique") > 1) | (variants == 1)]
+    others = runs.assign(section=runs["env"] + ": variants of " + names, label=runs["variant"].replace("", None))
+    others = others[variants > 1].fillna({"label": names})
+    return pd.concat([alike, others]).sort_values("env", key=lambda env: env.map(envs.IDS.index), kind="stable")
 
 
-def draw(ax, section, evaluations, kind):
+def draw(ax, runs, evaluations, kind):
     """A panel of learning curves: the "mean" with standard errors, or the "IQM" with 95% bootstrap intervals."""
-    levels = {name: x["return"] for name, x in REFERENCES.get(section.env, {}).items()}
-    for name, level in levels.items():
-        style = "--" if name == "scripted" else ":"
-        ax.axhline(level, color=GREY, lw=1.2, ls=style, label=f"{name} policy", zorder=1)
-    others, n = iter(OTHERS * 9), section.runs["label"].nunique()
-    for i, (label, of) in enumerate(section.groups):
-        colour, marker = next((style for name, *style in ALGORITHMS.values() if name == label), None) or next(others)
+    styles, others = {name: style for name, *style in ALGORITHMS.values()}, iter(OTHERS * 9)
+    groups = runs.groupby("label", sort=False)
+    for i, (label, of) in enumerate(groups):
+        colour, marker = styles.get(label) or next(others)
         curves = evaluations[evaluations["run"].isin(of.index)].pivot(index="run", columns="step", values="return")
         curves = curves.dropna(axis=1)  # at the steps that all runs have
         if kind == "mean":
-            middle, error = curves.mean(), curves.sem()
-            low, high = middle - error, middle + error
+            middle, low, high = curves.mean(), curves.mean() - curves.sem(), curves.mean() + curves.sem()
         else:
             middle, (low, high) = iqm(curves, axis=0), interval([curves.to_numpy().T], iqm)
         x, every = curves.columns / 1000, max(1, curves.shape[1] // 8)
+        marks = dict(marker=marker, ms=4.5, markevery=(i * every // len(groups), every))
         ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0, zorder=2)
-        ax.plot(x, middle, color=colour, lw=1.7, marker=marker, ms=4.5, markevery=(i * every // n, every), label=label,
-                zorder=3 + n - i)  # fmt: skip
-    if len(levels) == 2:  # early curves may go far down: half of the way from random to scripted below random will do
-        bottom = max(ax.get_ylim()[0], levels["random"] - (levels["scripted"] - levels["random"]) / 2)
-        top = max(np.max(line.get_ydata()) for line in ax.lines)
-        ax.set_ylim(bottom, top + 0.05 * (top - bottom))
+        ax.plot(x, middle, color=colour, lw=1.7, label=label, zorder=3 + len(groups) - i, **marks)
+    floor, ceiling = (REFERENCES[runs["env"].iloc[0]][kind]["return"] for kind in ("random", "scripted"))
+    ax.axhline(floor, color=GREY, lw=1.2, ls=":", label="random policy", zorder=1)
+    ax.axhline(ceiling, color=GREY, lw=1.2, ls="--", label="scripted policy", zorder=1)
+    # Early curves may go far down: half of the way from random to scripted below random will do
+    bottom = max(ax.get_ylim()[0], floor - (ceiling - floor) / 2)
+    top = max(np.max(line.get_ydata()) for line in ax.lines)
+    ax.set_ylim(bottom, top + 0.05 * (top - bottom))
     ax.set(xlim=0, xlabel="environment steps (thousands)")
     ax.grid(alpha=0.25, lw=0.6)
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def write_figure(path, rows, evaluations):
-    """A PNG of rows of panels, (section or None, kind, title) each, with one legend."""
-    figure = plt.figure(figsize=(max(10, 3.5 * max(map(len, rows))), 1 + 3.4 * len(rows)), layout="constrained")
+def plot(path, rows, evaluations):
+    """A PNG of rows of panels, (title, runs, kind) each, with one legend; panels without runs stay empty."""
+    size = len(rows), max(map(len, rows))
+    figure, axes = plt.subplots(*size, figsize=(max(10, 3.5 * size[1]), 1 + 3.4 * size[0]), squeeze=False,
+                                layout="constrained")  # fmt: skip
     legend = {}
-    for row, part in zip(rows, np.atleast_1d(figure.subfigures(len(rows))), strict=True):
-        for (section, kind, title), ax in zip(row, np.atleast_1d(part.subplots(1, len(row))), strict=True):
+    for row, panels in zip(axes, rows, strict=True):
+        row[0].set_ylabel("return of greedy episodes")
+        for ax, (title, runs, kind) in itertools.zip_longest(row, panels, fillvalue=("", [], "")):
             ax.set_title(title, fontsize=10)
-            if section:
-                draw(ax, section, evaluations, kind)
+            if len(runs):
+                draw(ax, runs, evaluations, kind)
                 legend |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
             else:
-                ax.set(xticks=[], yticks=[], xlabel="no runs")
-        part.axes[0].set_ylabel("return of greedy episodes")
-    names = sorted(legend, key=lambda name: legend[name].get_color() == GREY)  # the algorithms first
-    columns = max(1, int(11 * figure.get_figwidth()) // (max(map(len, names)) + 9))  # as many as fit side by side
-    figure.legend([legend[name] for name in names], names, loc="outside lower center", ncols=columns, frameon=False)
+                ax.axis("off")
+    columns = max(1, int(11 * figure.get_figwidth()) // (max(map(len, legend)) + 9))  # as many as fit side by side
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, frameon=False)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
 
-def write_figures(sections, evaluations, output):
-    """A figure of each section, one of all tasks, and those of the paper; returns the names of the last two kinds."""
-    for section in sections:
-        row = [(section, "mean", f"{section.title}: mean ± standard error"), (section, "IQM", "IQM, 95% interval")]
-        write_figure(output / file_of(section), [row], evaluations)
-    first = first_sections(sections)
-    tasks = list(first)
-    figures = {"overview": [tasks[i : i + 4] for i in range(0, len(tasks), 4)]}
-    figures |= {name: rows for name, rows in FIGURES.items() if all(set(row) & set(tasks) for row in rows)}
-    for name, rows in figures.items():
-        panels = [[(first.get(env), "mean", env) for env in row] for row in rows]
-        write_figure(output / f"{name}.png", panels, evaluations)
-    return list(figures)
-
-
-def first_sections(sections):
-    """The first section of each task, by task."""
-    last_first = {section.env: section for section in reversed(sections)}
-    return dict(reversed(last_first.items()))
-
-
-def file_of(section):
+def file_of(title):
     """The name of a section's figure."""
-    return re.sub(r"[^\w=.-]+", "_", section.title) + ".png"
+    return re.sub(r"[^\w=.-]+", "_", title)
 
 
-def table(head, rows):
-    """A Markdown table."""
-    return "".join("| " + " | ".join(map(str, line)) + " |\n" for line in (head, ["---"] * len(head), *rows)) + "\n"
+def make_figures(sections, first):
+    """Rows of panels, see `plot`, by the name of the figure: all tasks, the paper's figure, and each section."""
+    panels = {env: (f"{env}: no runs", [], "") for row in FIGURE_4 for env in row}
+    panels |= {env: (env, runs, "mean") for env, runs in first.groupby("env")}
+    tasks = list(first["env"].unique())
+    figures = {"overview": [[panels[env] for env in tasks[i : i + 4]] for i in range(0, len(tasks), 4)]}
+    if all(set(tasks) & set(row) for row in FIGURE_4):
+        figures["figure-4"] = [[panels[env] for env in row] for row in FIGURE_4]
+    for title, runs in sections.groupby("section", sort=False):
+        row = [(f"{title}: mean ± standard error", runs, "mean"), ("IQM, 95% interval", runs, "IQM")]
+        figures[file_of(title)] = [row]
+    return figures
+
+
+def table(rows, columns=None):
+    """A Markdown table of rows, {column: cell} each; cells that a row does not have are empty."""
+    frame = pd.DataFrame(rows, columns=columns, dtype=object).fillna("")
+    lines = [frame.columns, ["---"] * frame.shape[1], *frame.to_numpy()]
+    return "".join("| " + " | ".join(map(str, line)) + " |\n" for line in lines) + "\n"
+
+
+def digits_of(env):
+    return 3 if env.startswith("ct") else 1
 
 
 def plus_minus(x, digits):
@@ -251,112 +220,109 @@ def with_interval(samples, statistic, digits):
     return f"{statistic(*samples):.{digits}f}" + ("" if np.isnan(low) else f" [{low:.{digits}f}, {high:.{digits}f}]")
 
 
-def performance_table(section):
-    """The final performance of a section's groups, and below them what it can be compared with."""
-    rows, digits = [], section.digits
-    for label, of in section.groups:
-        paper = PAPER.get(section.env, {}).get(of["algorithm"].iloc[0]) if (of["variant"] == "").all() else None
-        k, n, solved = of["solved"].sum(), len(of), ""
-        if of["optimum"].notna().all():
+def performance_table(runs):
+    """The final performance of each label, and below it the random and the scripted policy's."""
+    env, rows = runs["env"].iloc[0], []
+    digits = digits_of(env)
+    for label, of in runs.groupby("label", sort=False):
+        k, n, row = of["solved"].sum(), len(of), {"": label}
+        row |= {"runs": n, "steps": f"{of['step'].max():,}", "return: mean ± SE": plus_minus(of["return"], digits)}
+        row |= {"IQM [95%]": with_interval([of["return"]], iqm, digits), "solved [95%]": ""}
+        if REFERENCES[env]["scripted"]["optimal"]:
             low, high = stats.binomtest(k, n).proportion_ci(method="exact")
-            solved = f"{k} of {n} [{low:.2f}, {high:.2f}]"
-        rows.append([label, n, f"{of['step'].max():,}", plus_minus(of["return"], digits),
-                     with_interval([of["return"]], iqm, digits), solved, plus_minus(of["discounted_return"], digits),
-                     f"{of['success'].mean():.2f}", f"{paper[0]:g} ± {paper[1]:g}" if paper else "",
-                     f"{of['seconds'].mean() / 60:.1f} min"])  # fmt: skip
-    for kind, x in REFERENCES.get(section.env, {}).items():
-        value = f"{x['return']:.{digits}f} ± {x['se']:.{digits}f}"
-        discounted = f"{x['discounted_return']:.{digits}f}"
-        rows.append([f"*{x.get('name', kind)}*", "", "", value, "", "", discounted, f"{x['success']:.2f}", "", ""])
-    return table(["", "runs", "steps", "return: mean ± SE", "IQM [95%]", "solved [95%]", "discounted: mean ± SE",
-                  "success", "paper", "time per run"], rows)  # fmt: skip
+            row["solved [95%]"] = f"{k} of {n} [{low:.2f}, {high:.2f}]"
+        row |= {"discounted: mean ± SE": plus_minus(of["discounted_return"], digits)}
+        row |= {"success": f"{of['success'].mean():.2f}", "time per run": f"{of['seconds'].mean() / 60:.1f} min"}
+        rows.append(row)
+    for kind, x in REFERENCES[env].items():
+        row = {"": f"*{x.get('name', kind)}*", "return: mean ± SE": f"{x['return']:.{digits}f} ± {x['se']:.{digits}f}"}
+        row |= {"discounted: mean ± SE": f"{x['discounted_return']:.{digits}f}", "success": f"{x['success']:.2f}"}
+        rows.append(row)
+    return table(rows)
 
 
-def comparison_table(samples):
-    """P(X > Y) for all pairs. samples: by label a list with the final returns on each task."""
-    rows = []
-    for x, of_x in samples.items():
-        pairs = {y: [a for pair in zip(of_x, of_y, strict=True) for a in pair] for y, of_y in samples.items()}
-        rows.append([x, *("" if x == y else with_interval(both, improvement, 2) for y, both in pairs.items())])
-    return table(["P(row > column)", *samples], rows) if len(samples) > 1 else ""
+def samples(runs, column):
+    """{label: [the runs' values on each task]} of the labels that have runs on all tasks."""
+    found = {}
+    for label, of in runs.groupby("label", sort=False):
+        if of["env"].nunique() == runs["env"].nunique():
+            found[label] = [values.to_numpy() for _, values in of.groupby("env", sort=False)[column]]
+    return found
 
 
-def over_tasks(sections):
-    """IQM on each task and over all of them, for the algorithms that were run on all; and their comparison."""
-    cells, scaled = {}, {}
-    for env, section in sections.items():
-        known = REFERENCES.get(env, {})
-        low, high = (known.get(kind, {}).get("return", np.nan) for kind in ("random", "scripted"))
-        for label, of in section.groups:
-            cells.setdefault(label, {})[env] = with_interval([of["return"]], iqm, section.digits)
-            scaled.setdefault(label, []).append(((of["return"] - low) / (high - low)).to_numpy())
-        for kind, x in known.items():
-            cells.setdefault(f"*{kind} policy*", {})[env] = f"{x['return']:.{section.digits}f}"
-    everywhere = {name: samples for name, samples in scaled.items() if len(samples) == len(sections) > 1}
-    for name, samples in everywhere.items():
-        cells[name]["all, scaled"] = with_interval(samples, iqm, 3)
-    columns = [*sections, *(["all, scaled"] if everywhere else [])]
-    cells = {name: cells[name] for name in sorted(cells, key=lambda name: name[0] == "*")}  # the references last
-    text = table(["", *columns], [[name, *(of.get(column, "") for column in columns)] for name, of in cells.items()])
-    return text + (f"Over all tasks:\n\n{comparison_table(everywhere)}" if everywhere else "")
+def comparison_table(runs):
+    """P(X > Y) over all tasks, for all pairs of labels that have runs on all of them."""
+    returns, rows = samples(runs, "return"), []
+    for x in returns:
+        values = {y: with_interval(returns[x] + returns[y], improvement, 2) for y in returns if y != x}
+        rows.append({"P(row > column)": x} | values)
+    return table(rows, ["P(row > column)", *returns]) if len(rows) > 1 else ""
 
 
-def sources(runs):
-    """A table of what was run, by which code."""
-    same = ["algorithm", "env", "flags", "commit", "checksum", "processor"]
-    seeds = runs.groupby(same, sort=False)["seed"].agg(lambda of: " ".join(map(str, of))).reset_index()
-    return table(list(seeds), seeds.to_numpy())
+def overview_table(runs):
+    """The IQM on each task and, of labels that have runs on all of several, over all tasks."""
+    tasks, rows = list(runs["env"].unique()), []
+    scaled = samples(runs, "scaled") if len(tasks) > 1 else {}
+    for label, of in runs.groupby("label", sort=False):
+        row = {env: with_interval([returns], iqm, digits_of(env)) for env, returns in of.groupby("env")["return"]}
+        if label in scaled:
+            row["all, scaled"] = with_interval(scaled[label], iqm, 3)
+        rows.append({"": label, **row})
+    for kind in ("random", "scripted"):
+        row = {env: f"{REFERENCES[env][kind]['return']:.{digits_of(env)}f}" for env in tasks}
+        rows.append({"": f"*{kind} policy*", **row})
+    return table(rows, ["", *tasks, *(["all, scaled"] if scaled else [])])
 
 
-def markdown(sections, runs, notes, figures):
+def markdown(sections, first, figures, runs, notes):
     """The report's text."""
     text = f"""# Results
 
 Returns of greedy policies. A run's final performance is the mean of its last {LAST} evaluations; a row is over its
 runs, one for each seed. SE: standard error. IQM: interquartile mean, a quarter of the runs, rounded down, left out at
-either end, with the 95% interval of {RESAMPLES:,} bootstrap resamples, stratified by task. Solved: runs with
-{SOLVED:.0%} of the optimal return or more in each of these {LAST} evaluations, with the exact 95% interval of Clopper
-and Pearson. P(row > column): the probability that a run of the row ends above one of the column; ties count half.
-Scaled: the random policy has 0 and the scripted policy 1. The paper says neither whether its returns are discounted
-nor what its ± is. Time per run is wall-clock, beside whatever else the machine did.
+either end, with the 95% interval of {RESAMPLES:,} bootstrap resamples, stratified by task; of less than ten runs it
+tends to be too narrow. Solved: runs with {SOLVED:.0%} of the optimal return or more in each of these {LAST}
+evaluations, with the exact 95% interval of Clopper and Pearson. P(row > column): the probability that a run of the row
+ends above one of the column; ties count half. Scaled: the random policy has 0 and the scripted policy 1. Time per run
+is wall-clock, beside whatever else the machine did.
 
 """
-    if runs.groupby(["env", "algorithm", "variant"]).size().min() < 10:
-        text += "**Few seeds.** Bootstrap intervals of less than ten runs know nothing of outcomes that none of the\n"
-        text += "runs had, and tend to be too narrow.\n\n"
-    text += "".join(f"![{name}]({name}.png)\n\n" for name in figures)
-    text += f"IQM of the final returns [95%]:\n\n{over_tasks(first_sections(sections))}"
-    for section in sections:
-        text += f"## {section.title}\n\n![{section.title}]({file_of(section)})\n\n{performance_table(section)}"
-        steps = section.groups["step"].max()
+    text += "".join(f"![{name}]({name}.png)\n\n" for name in ("overview", "figure-4") if name in figures)
+    text += f"IQM of the final returns [95%]:\n\n{overview_table(first)}"
+    if first["env"].nunique() > 1 and (comparison := comparison_table(first)):
+        text += f"Over all tasks:\n\n{comparison}"
+    for title, of in sections.groupby("section", sort=False):
+        text += f"## {title}\n\n![{title}]({file_of(title)}.png)\n\n{performance_table(of)}"
+        labels = of.groupby("label")
+        steps = labels["step"].max()
         if steps.max() > 1.01 * steps.min():  # a run may go on to a whole step of its environments
             text += "**The rows differ in their environment steps**: this is not a comparison at equal budgets.\n\n"
-        if section.groups["checksum"].nunique().max() > 1:
+        if labels["checksum"].nunique().max() > 1:
             text += "**Some rows have runs of several versions of the code.**\n\n"
-        text += comparison_table({label: [of["return"]] for label, of in section.groups})
+        text += comparison_table(of)
     text += "## Sources\n\nA flag name=value is --name value on the command line of python ALGORITHM.py --env ENV "
-    text += f"--seed SEED. The checksum is of the script and envs/*.py.\n\n{sources(runs)}"
+    text += "--seed SEED. The checksum is of the script and envs/*.py.\n\n"
+    sources = runs.groupby(["algorithm", "env", "flags", "commit", "checksum"], sort=False)["seed"]
+    text += table(sources.agg(lambda seeds: " ".join(map(str, seeds))).reset_index())
     return text + "".join(f"- {note}\n" for note in notes)
 
 
 def main(argv=None):
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="*", default=[record.RESULTS], metavar="RUNS", help="default: benchmark/results")
     parser.add_argument("-o", "--output", type=Path, default=record.RESULTS, help="folder (default: benchmark/results)")
     args = parser.parse_args(argv)
-    notes = []
-
-    def warn(note):
+    runs, evaluations, notes = read_runs(args.runs)
+    for note in notes:
         print(f"report: {note}", file=sys.stderr)
-        notes.append(note)
-
-    runs, evaluations = read_runs(args.runs, warn)
-    sections = list(make_sections(runs))
+    sections = make_sections(runs)
+    first = sections[sections["section"] == sections.groupby("env")["section"].transform("first")]
+    figures = make_figures(sections, first)
     try:
         args.output.mkdir(parents=True, exist_ok=True)
-        figures = write_figures(sections, evaluations, args.output)
-        (args.output / "README.md").write_text(markdown(sections, runs, notes, figures))
+        for name, rows in figures.items():
+            plot(args.output / f"{name}.png", rows, evaluations)
+        (args.output / "README.md").write_text(markdown(sections, first, figures, runs, notes))
     except OSError as error:
         fail(f"cannot write to {args.output}: {error.strerror}")
     print(args.output / "README.md")

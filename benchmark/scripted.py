@@ -3,21 +3,18 @@
     python benchmark/scripted.py                                   a table, all tasks
     python benchmark/scripted.py -o benchmark/references.json      and the file that benchmark/report.py reads
 
-The scripts see the whole simulator. What they reach, and what can be reached at all:
+The scripts see the whole simulator. Those of Box Pushing and Warehouse are optimal for the undiscounted return:
 
-- Box Pushing: both robots walk to the big box at once and push it. That is the shortest way, so the return is the
-  optimum: 100 - 0.1 (1.5 g - 4) on a g x g grid.
-- Warehouse: the arm hands out the tools in a fixed order and each robot takes a fixed load to the humans, `LOADS`.
-  These loads were found by a search over such plans and are optimal, since no episode that delivers every tool ends
-  earlier. wtd-s: its human begins the third phase in step 40, so the last tool cannot be given before step 41, and
-  300 - 41 = 259. The other layouts: the arm needs 10 steps a tool and a robot 7 more to the nearest human, so the last
-  of 6 or 9 tools arrives in step 67 or 97 at the earliest, and 600 - 67 = 533, 900 - 97 = 803. (Optimal for the
-  undiscounted return: nobody has looked for the best discounted one.)
-- Capture Target: "always Move-to-T" is not optimal, only simple. With primitive actions every agent walks towards the
-  target, which the script sees all the time and the agents do not.
+- Box Pushing: both robots walk to the big box at once and push it, the shortest way, so on a g x g grid the return is
+  100 - 0.1 (1.5 g - 4).
+- Warehouse: no episode that delivers every tool ends earlier than with these `LOADS`, found by search. wtd-s: the human
+  begins the third phase in step 40, so the last tool is given in step 41 at the earliest: 300 - 41 = 259. The others:
+  the arm needs 10 steps a tool and a robot 7 more to the nearest human, so the last of 6 or 9 tools arrives in step 67
+  or 97 at the earliest: 600 - 67 = 533, 900 - 97 = 803.
+- Capture Target: always Move-to-T (with primitive actions: towards the target) is not optimal, only simple.
 
-A policy is a function of (env, infos, rng) that gives the macro-actions, int [N, n], of a batch of N environments with
-n agents; rng is a NumPy generator. Entries of agents that are not free do not matter.
+A policy is a function of (env, rng) that gives the macro-actions, int [N, n], of N environments with n agents; those of
+agents that are not free do not matter.
 """
 
 import argparse
@@ -33,11 +30,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script, Python lo
 import envs
 from envs.box_pushing import NORTH, PUSH, STAY, WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT
 
-# The discounts that the algorithm scripts use for a family, so that discounted returns can be put side by side.
+# As in the algorithm scripts, so that discounted returns can be put side by side
 GAMMA = {"bp": 0.95, "wtd": 0.99, "ct": 0.9}
 
-# For each layout the loads in the order in which the arm hands them out: a robot, and the humans to whom it then goes.
-# A human gets its tools in the order in which it needs them. Three robots can always take one tool at a time, in turn.
+# In the order in which the arm hands them out: a robot, and the humans to whom it goes. A human gets its tools in
+# the order in which it needs them. Three robots can always take one tool at a time, in turn.
 LOADS = {
     "s": [(1, [0]), (0, [0]), (1, [0])],
     "d": [(0, [0]), (1, [1]), (0, [0]), (1, [1]), (0, [0]), (1, [1])],
@@ -51,24 +48,19 @@ def fail(message):
     raise SystemExit(f"scripted: {message}")
 
 
-def random_policy(env, infos, rng):
-    """Every free agent picks a macro-action uniformly at random."""
+def random_policy(env, rng):
     return rng.integers(env.n_actions, size=(env.num_envs, env.n_agents))
 
 
-def push_big_box(env, infos, rng):
+def push_big_box(env, rng):
     """Box Pushing: walk to the cells below the big box, wait for the other robot, push together."""
     waypoint = np.array([WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT])
-    if env.primitive:
-        return _walk_and_push(env, env.cell_x[waypoint])
-    placed = env.last_waypoint == waypoint  # [N, agents]
-    return np.where(placed.all(1, keepdims=True), PUSH, np.where(placed, STAY, waypoint))
-
-
-def _walk_and_push(env, x):
-    """Primitive Box Pushing: first along the row, then up to the big box at columns x, [agents], then forward."""
+    if not env.primitive:
+        placed = env.last_waypoint == waypoint  # [N, agents]
+        return np.where(placed.all(1, keepdims=True), PUSH, np.where(placed, STAY, waypoint))
     forward, left, right, stay = range(4)
-    dx, dy = x - env.position[..., 0], env.box_y[:, 2:] - 1 - env.position[..., 1]  # [N, agents]
+    dx = env.cell_x[waypoint] - env.position[..., 0]  # first along the row, then up
+    dy = env.box_y[:, 2:] - 1 - env.position[..., 1]
     heading = np.where(dx > 0, 1, np.where(dx < 0, 3, np.where(dy < 0, 2, NORTH)))
     turn = (heading - env.orientation) & 3
     placed = (dx == 0) & (dy == 0) & (turn == 0)
@@ -76,12 +68,11 @@ def _walk_and_push(env, x):
     return np.where(waits, stay, np.choose(turn, [forward, right, right, left]))
 
 
-def deliver(env, infos, rng, loads):
+def deliver(env, rng, loads):
     """Warehouse: the arm hands out the tools of `loads`, [(robot, [human, ...]), ...], in this order.
 
-    The arm passes the oldest staged tool as soon as the robot that is to get it waits at the table, else searches the
-    next one while there is room. A robot waits at the table until its load is complete, delivers it in order, waiting
-    at a workshop until the human wants the tool, and comes back.
+    The arm passes the oldest staged tool as soon as its robot waits at the table, else searches the next one if there
+    is room. A robot waits until its load is complete, delivers it in order and comes back.
     """
     get_tool, capacity = env.n_humans + 1, env.staging_capacity
     robot = np.array([robot for robot, humans in loads for _ in humans])  # [tools], of each tool in the arm's order
@@ -110,16 +101,13 @@ def deliver(env, infos, rng, loads):
     return actions
 
 
-def move_to_target(env, infos, rng):
-    """Capture Target: Move-to-T, whatever is seen."""
-    return np.zeros(env.macro_done.shape, np.int64)
-
-
-def step_to_target(env, infos, rng):
-    """Primitive Capture Target: step along the axis on which the target is further away, the short way round."""
+def go_to_target(env, rng):
+    """Capture Target: Move-to-T or, primitive, a step along the axis on which the target is further away."""
+    if not env.primitive:
+        return np.zeros(env.macro_done.shape, np.int64)
     north, south, west, east, stay = range(5)
     half = env.grid // 2
-    to_go = (env.target[:, None] - env.position + half) % env.grid - half  # [N, agents, (x, y)]
+    to_go = (env.target[:, None] - env.position + half) % env.grid - half  # [N, agents, (x, y)], the short way round
     dx, dy = to_go[..., 0], to_go[..., 1]
     along_y = np.where(dy > 0, north, np.where(dy < 0, south, stay))
     return np.where(np.abs(dx) > np.abs(dy), np.where(dx > 0, east, west), along_y)
@@ -131,33 +119,31 @@ def script_of(env_id):
         return "both push the big box", push_big_box, True
     if env_id.startswith("wtd"):
         return "fixed loads", partial(deliver, loads=LOADS[env_id.split("-")[1]]), True
-    if env_id.endswith("primitive"):
-        return "always towards the target", step_to_target, False
-    return "always Move-to-T", move_to_target, False
+    name = "always towards the target" if env_id.endswith("primitive") else "always Move-to-T"
+    return name, go_to_target, False
 
 
 def play(env_id, policy, episodes, seed, gamma):
     """Plays episodes side by side: a dict of return, discounted_return, length and success, float64 [episodes] each."""
     env, rng = envs.make(env_id, episodes), np.random.default_rng(seed)
-    _, infos = env.reset(seed=seed)
+    env.reset(seed=seed)
     result = {key: np.zeros(episodes) for key in ("return", "discounted_return", "length", "success")}
     live, step = np.ones(episodes, bool), 0
     while live.any():
-        _, rewards, terminations, truncations, infos = env.step(policy(env, infos, rng))
+        _, rewards, terminations, truncations, infos = env.step(policy(env, rng))
         for key, value in zip(result, (rewards, gamma**step * rewards, 1, infos["success"]), strict=True):
             result[key] += live * value
         over, step = terminations | truncations, step + 1
         live &= ~over
         if over.any():  # play on in ended environments without looking
-            _, infos = env.reset(options={"reset_mask": over})
+            env.reset(options={"reset_mask": over})
     return result
 
 
 def reference(env_id, policy, episodes, seed=0):
     """Means over episodes, with the standard error of the return; rounded, so that files can be compared."""
     result = play(env_id, policy, episodes, seed, GAMMA[env_id.split("-")[0]])
-    error = result["return"].std(ddof=1) / episodes**0.5
-    means = {"return": 0.0, "se": error} | {key: x.mean() for key, x in result.items()}
+    means = {key: x.mean() for key, x in result.items()} | {"se": result["return"].std(ddof=1) / episodes**0.5}
     return {key: round(float(x), 6) for key, x in means.items()} | {"episodes": episodes}
 
 
@@ -171,16 +157,14 @@ def main(argv=None):
     if args.episodes < 2:
         fail("--episodes must be at least 2")
     references = {}
-    print(f"{'task':16} {'policy':26} {'return':>9} {'+- SE':>7} {'discounted':>10} {'length':>7} success")
+    print(f"{'task':16} {'policy':26} return, its standard error, discounted return, length, success")
     for env_id in args.envs:
         name, script, optimal = script_of(env_id)
         scripted = {"name": name, "optimal": optimal, **reference(env_id, script, args.episodes)}
         references[env_id] = {"random": reference(env_id, random_policy, args.episodes), "scripted": scripted}
         for kind, x in references[env_id].items():
-            row = (
-                f"{env_id:16} {x.get('name', kind):26} {x['return']:9.3f} {x['se']:7.3f} {x['discounted_return']:10.3f}"
-            )
-            print(f"{row} {x['length']:7.2f} {x['success']:7.3f}", flush=True)
+            numbers = " ".join(f"{x[key]:10.3f}" for key in ("return", "se", "discounted_return", "length", "success"))
+            print(f"{env_id:16} {x.get('name', kind):26} {numbers}", flush=True)
     if args.output:
         try:
             args.output.write_text(json.dumps(references, indent=1) + "\n")

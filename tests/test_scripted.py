@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import envs
-from benchmark.scripted import LOADS, deliver, main, move_to_target, play, random_policy, reference, script_of
+from benchmark.scripted import LOADS, deliver, go_to_target, main, play, random_policy, reference, script_of
 
 REFERENCES = json.loads((Path(__file__).parents[1] / "benchmark" / "references.json").read_text())
 OPTIMA = {
@@ -29,41 +29,41 @@ def test_the_script_reaches_the_optimum(env_id):
 @pytest.mark.parametrize("env_id", ["bp-10", "bp-10-primitive"])
 def test_the_box_is_pushed_on_other_grids(env_id, grid):
     env = envs.make(env_id, 2, grid=grid)
-    _, infos = env.reset(seed=0)
+    env.reset(seed=0)
     while not env.over.any():
-        _, _, _, _, infos = env.step(script_of(env_id)[1](env, infos, None))
+        env.step(script_of(env_id)[1](env, None))
     np.testing.assert_allclose(env.episode_return, 100 - 0.1 * (1.5 * grid - 4))
 
 
 @pytest.mark.parametrize("env_id", ["bp-10", "bp-10-primitive"])
 def test_a_robot_that_is_there_first_waits(env_id):
     env = envs.make(env_id, agent_starts=[(3.5, 4.5), (8.5, 1.5)])
-    _, infos = env.reset(seed=0)
+    env.reset(seed=0)
     while not env.over.any():
-        _, _, _, _, infos = env.step(script_of(env_id)[1](env, infos, None))
+        env.step(script_of(env_id)[1](env, None))
     np.testing.assert_allclose(env.episode_return, 98.9)
 
 
 @pytest.mark.parametrize("layout", LOADS)
 def test_the_arm_finishes_what_it_began_with_primitive_actions(layout):
     env = envs.make(f"wtd-{layout}", primitive=True)
-    _, infos = env.reset(seed=0)
+    env.reset(seed=0)
     while not env.over.any():
-        _, _, _, _, infos = env.step(deliver(env, infos, None, LOADS[layout]))
+        env.step(deliver(env, None, LOADS[layout]))
     np.testing.assert_allclose(env.episode_return, OPTIMA[f"wtd-{layout}"])
 
 
 @pytest.mark.parametrize("env_id", ["wtd-t", "wtd-s-primitive", "bp-10"])
 def test_environments_out_of_step_do_not_disturb_each_other(env_id):
     env, policy, returns = envs.make(env_id, 3), script_of(env_id)[1], []
-    _, infos = env.reset(seed=0)
+    env.reset(seed=0)
     for step in range(2 * env.horizon):
         if step in (5, 13):
-            _, infos = env.reset(options={"reset_mask": np.array([False, step == 5, step == 13])})
-        _, _, terminations, truncations, infos = env.step(policy(env, infos, None))
+            env.reset(options={"reset_mask": np.array([False, step == 5, step == 13])})
+        _, _, terminations, truncations, _ = env.step(policy(env, None))
         over = terminations | truncations
         returns += env.episode_return[over].tolist()
-        _, infos = env.reset(options={"reset_mask": over})
+        env.reset(options={"reset_mask": over})
     assert len(returns) >= 6
     np.testing.assert_allclose(returns, OPTIMA[env_id])
 
@@ -86,7 +86,7 @@ def test_one_robot_alone_is_late():
 
 
 def test_always_move_to_target():
-    result = play("ct-10", move_to_target, 4000, seed=1, gamma=0.98)
+    result = play("ct-10", go_to_target, 4000, seed=1, gamma=0.98)
     assert 0.50 < result["return"].mean() < 0.55
     assert np.array_equal(result["return"], result["success"])
 
