@@ -177,9 +177,7 @@ def over_rows(batch, *networks):
 
 def team_batch(batch, team):
     """The batch of the team as one agent, which decides at every row."""
-    inside = (batch["valid"] | batch["valid"].roll(1, 1))[
-        ..., None
-    ]  # [B, T, 1], rows of the window and the one after it
+    inside = (batch["valid"] | batch["valid"].roll(1, 1))[..., None]  # [B, T, 1], with the row after the window
     last = (inside.cumsum(1) - 1).expand_as(batch["chosen"])  # [B, T, n], beyond the window that at its end
     free = batch["chosen"].gather(1, last)  # [B, T, n]
     before = torch.where(free, batch["previous"], batch["action"])  # [B, T, n]

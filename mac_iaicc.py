@@ -231,10 +231,8 @@ def own_returns(batch, values, n_step):
     it runs a macro-action, over l of its macro-actions, is X_l[k] = r[k] + gamma^tau (X_l[k + 1] if the macro-action
     still runs at the next row, else X_{l-1}[k + 1]), X_0 being V'_i, as are all of them at the episode's final row.
     values: float32 [B, T, n], V'_i of each agent's target critic. n_step: macro-actions in a return."""
-    returns, later = (
-        torch.zeros_like(values),
-        values.new_zeros(n_step, *values[:, 0].shape),
-    )  # X_1 to X_n at the next row
+    returns = torch.zeros_like(values)
+    later = values.new_zeros(n_step, *values[:, 0].shape)  # X_1 to X_n at the next row
     final = batch["valid"].roll(1, 1) & ~batch["valid"]  # [B, T]
     for k in reversed(range(values.shape[1] - 1)):
         later = torch.where(final[:, k + 1, None], values[:, k + 1], later)
