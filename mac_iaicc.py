@@ -145,8 +145,7 @@ class Agents(nn.Module):
 
 def over_rows(batch, *networks):
     """Logits or values float32 [B, T, n, A] of each network at the rows of a batch.
-    A macro-history moves only where its agent chooses: networks run over every agent's own decisions, a fraction of the
-    rows. They are packed as Agents.forward wants them, and rows look up the latest one."""
+    A macro-history moves where its agent chooses: networks run over own decisions, packed; rows look up the last."""
     chosen = batch["chosen"].movedim(2, 0)  # [n, B, T]
     step = chosen.cumsum(2) - chosen[..., :1].int()  # [n, B, T], a window begins with what its agents saw last
     length = step[..., -1:]  # [n, B, 1]
@@ -342,7 +341,7 @@ def train(args, stop=()):
         for key, value in values.items():
             writer.add_scalar(f"{group}/{key}", value, step)
 
-    while step < args.total_timesteps and not stop:
+    while step < args.total_timesteps:
         # Choose and step
         progress, done = step / args.exploration_timesteps, step / args.total_timesteps
         epsilon = np.interp(progress, [0, 1], [args.start_e, args.end_e])
@@ -403,6 +402,8 @@ def train(args, stop=()):
             save(folder / "checkpoint.pt", args, parts=parts, buffer=memory, env=arrays, hidden=hidden,
                  rng=rng.bit_generator.state, counts=(step, updates, recent, best))  # fmt: skip
             saved_at = time.time()
+            if stop:
+                break
 
     bar.close()
     writer.close()
@@ -423,9 +424,10 @@ def load(path):
         saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
         if saved["algorithm"] != ALGORITHM:
             raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
+        Args(**saved["args"])  # fails where a setting is not one of this version
         return saved
     except Exception as error:  # torch names no common class for what a damaged file raises
-        raise SystemExit(f"cannot read {path}: {str(error).splitlines()[0]}") from None
+        raise SystemExit(f"cannot read {path}: {error}".splitlines()[0]) from None
 
 
 def parse_args(argv=None):

@@ -1,9 +1,10 @@
 """Run folders, checkpoints and the command line of the scripts, in processes of their own where one is killed."""
 
-import importlib.util
+import importlib
 import json
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -14,216 +15,420 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import avf_qplex
-from avf_qplex import Args, defaults, load_args, make_run_folder, parse_args, report, train
+from avf_qplex import Args, load, parse_args, save, train
 from tests.curves import scalars
+from tests.rollouts import TINY, Spy, args_for
+from tests.sync import SCRIPTS
 
 ROOT = Path(__file__).parents[1]
-TINY = dict(num_envs=4, total_timesteps=2_400, learning_starts=200, train_frequency=20, batch_size=8, window=6,
-            hidden_size=16, eval_frequency=400, eval_episodes=3, checkpoint_frequency=400)  # fmt: skip
 
 
 def flags(options):
     return [f"--{key.replace('_', '-')}={value}" for key, value in options.items()]
 
 
-def start(*arguments, cwd=ROOT):
-    command = [sys.executable, str(ROOT / "avf_qplex.py"), *map(str, arguments)]
+def start(script, *arguments):
+    """The script in a process of its own."""
+    command = [sys.executable, str(ROOT / f"{script}.py"), *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        command, cwd=cwd, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, cwd=ROOT, env=environment, text=True, **pipes)
 
 
-def wait_for_checkpoint(runs, process, step):
-    """Returns the run folder once its checkpoint has reached a step."""
-    for _ in range(1_200):
-        for path in runs.glob("*/checkpoint.pt"):
-            if torch.load(path, weights_only=True)["step"] >= step:
-                return path.parent
-        assert process.poll() is None, process.communicate()[1]
-        time.sleep(0.05)
-    raise AssertionError("no checkpoint within a minute")
+def run_as_program(monkeypatch, *arguments, script="avf_qplex"):
+    """The script as a program, in this process: the exit code and what it says last, as the interpreter would."""
+    monkeypatch.setattr(sys, "argv", [f"{script}.py", *map(str, arguments)])
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        runpy.run_path(str(ROOT / f"{script}.py"), run_name="__main__")
+        return 0, ""
+    except SystemExit as stopped:
+        code = stopped.code
+        return (code, "") if isinstance(code, int) else (1, str(code))
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("env_id, how", [("wtd-s", "kill"), ("ct-10", "kill"), ("bp-10", "interrupt")])
-def test_killed_and_resumed_equals_undisturbed(tmp_path, env_id, how):
-    """Every logged number, the replay memory and every weight; `kill` takes the process down wherever it is."""
-    options = {**TINY, "total_timesteps": 1_200 if env_id == "ct-10" else 4_000, "hidden_state": "stored"}
-    undisturbed = train(defaults(env_id, seed=5, runs_dir=str(tmp_path / "whole"), **options))
-    process = start(f"--env={env_id}", "--seed=5", f"--runs-dir={tmp_path / 'cut'}", *flags(options))
-    folder = wait_for_checkpoint(tmp_path / "cut", process, 400)
-    process.send_signal(signal.SIGKILL if how == "kill" else signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    if how == "interrupt":
-        assert process.returncode == 0 and "stopped at step" in errors and f"--resume {folder}" in errors, errors
-    cut_at = torch.load(folder / "checkpoint.pt", weights_only=True)["step"]
-    assert cut_at < options["total_timesteps"], "the run was cut before its end"
-    time.sleep(1.1)  # TensorBoard orders event files by the second in which they were made
-    assert train(parse_args([f"--resume={folder}"])) == folder
-    one, other = (torch.load(f / "checkpoint.pt", weights_only=True) for f in (undisturbed, folder))
-    assert one["step"] == other["step"] and one["updates"] == other["updates"] and one["rng"] == other["rng"]
-    for part in ("learner", "target", "buffer", "env"):
-        for key, value in one[part].items():
-            same = torch.equal(value, other[part][key]) if torch.is_tensor(value) else value == other[part][key]
-            assert same, f"{part} {key}"
-    # A killed run may have logged steps after its last checkpoint: the resumed one logs them again, with equal values.
-    expected, got = scalars(undisturbed), scalars(folder)
+def one_line(text):
+    return bool(text) and "\n" not in text.strip() and "Traceback" not in text
+
+
+def stop_in(monkeypatch, module, steps):
+    """A list of signals, in which one arrives in that step of training."""
+    stop, act, taken = [], module.act, []
+
+    def counted(*args):
+        taken.extend([1] * (len(args) > 4))  # evaluation gives neither epsilon nor generator
+        stop.extend([signal.SIGINT] * (len(taken) == steps))
+        return act(*args)
+
+    monkeypatch.setattr(module, "act", counted)
+    return stop
+
+
+class ArrivesAt:
+    """In the place of the list of signals: one arrives just before the n-th time that somebody looks."""
+
+    def __init__(self, look):
+        self.looks_left = look
+
+    def __bool__(self):
+        self.looks_left -= 1
+        return self.looks_left <= 0
+
+
+def reached(folder):
+    """The step of a run's checkpoint."""
+    return torch.load(folder / "checkpoint.pt", weights_only=True)["counts"][0]
+
+
+def same_run(one, other):
+    """Every logged number and every weight of two run folders."""
+    expected, got = scalars(one), scalars(other)
     assert expected.keys() == got.keys()
     for tag in expected:
         assert dict(got[tag]) == dict(expected[tag]), tag
+    for name in ("last.pt", "best.pt"):
+        models = [torch.load(folder / name, weights_only=True) for folder in (one, other)]
+        assert models[0]["step"] == models[1]["step"], name
+        for key, value in models[0]["networks"].items():
+            assert torch.equal(value, models[1]["networks"][key]), f"{name} {key}"
 
 
-def test_resume_can_extend_a_finished_run(tmp_path):
-    long = train(defaults("wtd-s", seed=0, runs_dir=str(tmp_path / "long"), **TINY))
-    short = train(defaults("wtd-s", seed=0, runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 1_200}))
-    assert train(parse_args([f"--resume={short}", "--total-timesteps=2400"])) == short
-    expected, got = scalars(long), scalars(short)
-    assert dict(got["eval/return"]) == dict(expected["eval/return"])
-    assert dict(got["losses/td_loss"]) == dict(expected["losses/td_loss"])
+@pytest.mark.parametrize(
+    "script, env_id, number",
+    [
+        ("avf_qplex", "wtd-s", signal.SIGKILL),
+        ("avf_qmix", "bp-10", signal.SIGTERM),
+        ("avf_vdn", "ct-10", signal.SIGINT),
+    ],
+)
+def test_killed_and_resumed_equals_undisturbed(tmp_path, script, env_id, number):
+    """A kill takes the process down wherever it is, an interrupt between two steps."""
+    module = importlib.import_module(script)
+    steps = {"wtd-s": 1_600, "bp-10": 4_000, "ct-10": 1_600}[env_id]
+    options = {**TINY, "total_timesteps": steps, "buffer_size": 8, "exploration_timesteps": 400}
+    undisturbed = module.train(args_for(module, env_id, seed=5, runs_dir=str(tmp_path / "whole"), **options))
+    # Checkpoints at every step where the process is killed, so that it happens in the middle of one as well.
+    frequency = 0.0 if number == signal.SIGKILL else 60.0
+    process = start(script, f"--env={env_id}", "--seed=5", f"--runs-dir={tmp_path / 'cut'}",
+                    f"--checkpoint-frequency={frequency}", *flags(options))  # fmt: skip
+    for _ in range(2_400):  # after the first evaluation
+        if any((tmp_path / "cut").glob("*/last.pt")) and (frequency or any((tmp_path / "cut").glob("*/checkpoint.pt"))):
+            break
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.025)
+    process.send_signal(number)
+    printed, errors = process.communicate(timeout=60)
+    (folder,) = (tmp_path / "cut").iterdir()
+    assert process.returncode == (-number if number == signal.SIGKILL else 128 + number)
+    if number != signal.SIGKILL:
+        assert printed == f"{folder}\n" and f"go on with: python {script}.py --resume {folder}" in errors
+    cut_at = reached(folder)
+    assert 0 < cut_at < steps, "the run was cut before its end"
+    time.sleep(1.1)  # TensorBoard orders event files by the second in which they were made
+    assert module.train(module.parse_args([f"--resume={folder}"])) == folder
+    same_run(undisturbed, folder)
+    assert not (folder / "checkpoint.pt").exists()
 
 
-def test_run_folder_holds_what_it_should(tmp_path, capsys):
-    folder = train(defaults("bp-10", seed=3, runs_dir=str(tmp_path), **TINY))
-    assert folder.name.startswith("bp-10__avf_qplex__3__")
-    assert json.loads((folder / "args.json").read_text())["algorithm"] == "avf_qplex"
-    assert load_args(folder) == defaults("bp-10", seed=3, runs_dir=str(tmp_path), **TINY)
-    models = torch.load(folder / "model.pt", weights_only=True)
-    curve = scalars(folder)
-    assert models["last"]["step"] == 2_400 and models["last"]["return"] == pytest.approx(curve["eval/return"][-1][1])
-    assert models["best"]["return"] == pytest.approx(max(value for _, value in curve["eval/return"]), rel=1e-6)
-    assert {"charts/episodic_return", "charts/epsilon", "eval/return", "eval/discounted_return"} <= curve.keys()
-    assert {"eval/length", "losses/td_loss", "losses/q_values", "losses/grad_norm"} <= curve.keys()
-    assert not capsys.readouterr().err.count("it/s"), "no progress bar where there is no terminal"
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_stopped_and_resumed_equals_undisturbed(tmp_path, monkeypatch, script):
+    """In this process, for each script; learning goes on where it was, with what was in the replay memory."""
+    module = importlib.import_module(script)
+    options = {key: value for key, value in TINY.items() if hasattr(module.Args, key)}
+    options |= dict(learning_rate_end=0.0, total_timesteps=1_200, train_frequency=20)
+    options |= dict(exploration_timesteps=400)  # random macro-actions would not tell what the networks remember
+    if script == "mac_iaicc":
+        options = {key: value for key, value in options.items() if key != "train_frequency"} | dict(batch_size=4)
+    undisturbed = module.train(args_for(module, "bp-10", seed=0, runs_dir=str(tmp_path / "whole"), **options))
+    args = args_for(module, "bp-10", seed=0, runs_dir=str(tmp_path / "cut"), **options)
+    folder = module.train(args, stop_in(monkeypatch, module, 130))
+    assert reached(folder) == 520
+    monkeypatch.undo()
+    time.sleep(1.1)  # TensorBoard orders event files by the second in which they were made
+    remembered, acted = module.load(folder / "checkpoint.pt")["hidden"], Spy(monkeypatch, module, "act")
+    assert module.train(module.parse_args([f"--resume={folder}"])) == folder
+    assert remembered.any() and torch.equal(acted.calls[0].hidden, remembered)
+    same_run(undisturbed, folder)
 
 
-def test_runs_never_share_a_folder(tmp_path):
-    folders = {make_run_folder(Args(runs_dir=str(tmp_path))) for _ in range(5)}
-    assert len(folders) == 5 and all((folder / "args.json").exists() for folder in folders)
+def test_a_run_that_is_stopped_before_its_first_step_can_go_on(tmp_path):
+    """Or it would look like one that is finished, with no model in it."""
+    folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY), [signal.SIGINT])
+    assert reached(folder) <= TINY["num_envs"] and not (folder / "last.pt").exists()
+    assert train(parse_args([f"--resume={folder}"])) == folder and (folder / "last.pt").exists()
 
 
-def test_evaluate_prints_and_animates(tmp_path, capsys):
-    folder = train(defaults("bp-10", runs_dir=str(tmp_path), **TINY))
-    gif = tmp_path / "policy.gif"
-    report(parse_args([f"--evaluate={folder}", "--eval-episodes=5", f"--gif={gif}", "--model=last", "--seed=9"]))
-    printed = capsys.readouterr().out
-    expected = torch.load(folder / "model.pt", weights_only=True)["last"]["return"]
-    line = next(line for line in printed.splitlines() if line.startswith("return"))
-    assert float(line.split()[1]) == pytest.approx(expected, abs=1e-3), "Box Pushing is deterministic"
-    assert "success" in printed and "discounted return" in printed and "last model of step 2400" in printed
-    with Image.open(gif) as animation:
-        assert animation.n_frames > 5 and np.asarray(animation.convert("RGB")).std() > 10
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([folder.name, gif.name]), (
-        "evaluating makes no run folder"
+@pytest.mark.parametrize("look", [1, 3, 5])
+def test_a_stop_is_never_without_a_checkpoint_of_its_step(tmp_path, monkeypatch, look):
+    """Wherever the signal arrives: here just before each of the first times that the loop looks for it."""
+    acted = Spy(monkeypatch, avf_qplex, "act")
+    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY)
+    folder = train(args, ArrivesAt(look))
+    assert reached(folder) == 4 * len(acted.calls)
+
+
+def test_a_finished_run(tmp_path, monkeypatch, capsys):
+    """What is in its folder, what it printed, and that it cannot be resumed."""
+    code, _ = run_as_program(monkeypatch, "--env=bp-10", "--seed=3", f"--runs-dir={tmp_path}",
+                             "--checkpoint-frequency=0.05", *flags(TINY))  # fmt: skip
+    printed = capsys.readouterr()
+    (folder,) = tmp_path.iterdir()
+    assert code == 0 and printed.out == f"{folder}\n" and folder.name.startswith("bp-10__avf_qplex__3__")
+    assert "it/s" not in printed.err, "no progress bar where there is no terminal"
+    assert re.findall(r"step (\d+): greedy return", printed.err) == ["400", "800", "1200"]
+    names = {path.name.split(".tfevents")[0] for path in folder.iterdir()}
+    assert names == {"args.json", "best.pt", "last.pt", "events.out"}
+    saved = json.loads((folder / "args.json").read_text())
+    assert saved.pop("algorithm") == "avf_qplex"
+    args = args_for(avf_qplex, "bp-10", seed=3, runs_dir=str(tmp_path), checkpoint_frequency=0.05, **TINY)
+    assert Args(**saved) == args
+    last, best, curve = load(folder / "last.pt"), load(folder / "best.pt"), scalars(folder)
+    assert last["step"] == 1_200 and last["return"] == pytest.approx(curve["eval/return"][-1][1])
+    assert best["return"] == pytest.approx(max(value for _, value in curve["eval/return"]), rel=1e-6)
+    assert Args(**last["args"]) == Args(**best["args"]) == args
+    assert {"charts/episodic_return", "charts/epsilon"} - curve.keys() <= {"charts/episodic_return", "charts/epsilon"}
+    assert {f"eval/{key}" for key in ("return", "discounted_return", "length", "success")} <= curve.keys()
+    code, message = run_as_program(monkeypatch, f"--resume={folder}")
+    assert code == 1 and one_line(message) and message.startswith(f"cannot read {folder}/checkpoint.pt: ")
+
+
+def test_what_is_logged(tmp_path):
+    """Of training every 2,000 steps, of the loss every 100 updates, and evaluations at the end in any case."""
+    options = {**TINY, "total_timesteps": 4_100, "train_frequency": 20, "learning_starts": 2_000}
+    curve = scalars(train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**options, "eval_frequency": 2_050})))
+    assert [step for step, _ in curve["charts/episodic_return"]] == [2_000, 4_000]
+    assert [step for step, _ in curve["eval/return"]] == [2_052, 4_100]
+    for key in ("td_loss", "q_values", "grad_norm"):
+        assert [step for step, _ in curve[f"losses/{key}"]] == [4_000], key
+
+
+def test_best_is_the_best_and_the_latest_of_equals(tmp_path, monkeypatch):
+    returns = iter([1.0, 3.0, 2.0, 3.0, 0.5, 1.0])
+    result = {"discounted_return": np.zeros(2), "length": np.ones(2), "success": np.zeros(2)}
+    monkeypatch.setattr(avf_qplex, "evaluate", lambda *args: result | {"return": np.full(2, next(returns))})
+    folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**TINY, "eval_frequency": 200}))
+    best, last = load(folder / "best.pt"), load(folder / "last.pt")
+    assert (best["step"], best["return"]) == (800, 3.0) and (last["step"], last["return"]) == (1_200, 1.0)
+    assert any(not torch.equal(value, last["networks"][key]) for key, value in best["networks"].items())
+
+
+def test_the_best_model_outlives_a_resume(tmp_path, monkeypatch):
+    returns = iter([3.0, 2.0, 1.0])
+    result = {"discounted_return": np.zeros(2), "length": np.ones(2), "success": np.zeros(2)}
+    monkeypatch.setattr(avf_qplex, "evaluate", lambda *args: result | {"return": np.full(2, next(returns))})
+    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY)
+    folder = train(args, stop_in(monkeypatch, avf_qplex, 120))
+    train(parse_args([f"--resume={folder}"]))
+    assert load(folder / "best.pt")["step"] == 400 and load(folder / "last.pt")["step"] == 1_200
+
+
+def test_a_kill_costs_at_most_a_minute(tmp_path, monkeypatch):
+    """By default a checkpoint is written every minute: with a clock that moves on by 7 s at each step."""
+    assert Args.checkpoint_frequency <= 60 and all(
+        importlib.import_module(script).Args.checkpoint_frequency <= 60 for script in SCRIPTS
     )
+    clock, saved_at = [1e9], []
+    monkeypatch.setattr(avf_qplex, "time", types.SimpleNamespace(time=lambda: clock[0], time_ns=time.time_ns))
+    saves, acted = Spy(monkeypatch, avf_qplex, "save"), avf_qplex.act
+
+    def act(*args):
+        clock[0] += 7 * (len(args) > 4)  # a step of training, not of evaluation
+        saved_at.extend([clock[0]] * (len([c for c in saves.calls if c.path.name == "checkpoint.pt"]) - len(saved_at)))
+        return acted(*args)
+
+    monkeypatch.setattr(avf_qplex, "act", act)
+    train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 400}))
+    times = np.array([1e9, *saved_at])
+    assert len(saved_at) >= 700 // 70 and np.diff(times).max() <= 60 + 2 * 7
+    assert 1e9 + 700 - times[-1] <= 60 + 2 * 7
+
+
+def test_runs_never_share_a_folder(tmp_path, monkeypatch):
+    """Two of the same microsecond: the second is refused in one line, and the first is left as it is."""
+    monkeypatch.setattr(avf_qplex, "time", types.SimpleNamespace(time=time.time, time_ns=lambda: 123_456))
+    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 40})
+    folder = train(args)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(FileExistsError):  # which the program turns into one line
+        train(args)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    monkeypatch.undo()
+    assert len({train(args) for _ in range(3)} | {folder}) == 4
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
         (["--env=wtd-x"], "unknown --env 'wtd-x'; valid ids: bp-10 bp-20"),
-        (["--gamma=1.5"], "--gamma must be between 0 and 1, got 1.5"),
-        (["--start-e=-0.1"], "--start-e must be between 0 and 1"),
-        (["--learning-rate=-1"], "--learning-rate must not be negative"),
-        (["--learning-rate=nan"], "--learning-rate must not be negative"),
-        (["--batch-size=0"], "--batch-size must be at least 1, got 0"),
-        (["--seed=-1"], "--seed must not be negative, got -1"),
-        (["--device=cuda:99"], "--device cuda:99 is not available"),
-        (["--device=abacus"], "--device abacus is not available"),
-        (["--resume=nowhere"], "nowhere is not a run folder"),
-        (["--evaluate=nowhere"], "nowhere is not a run folder"),
-        (["--evaluate=here", "--resume=there"], "--resume and --evaluate exclude each other"),
+        (["--gamma=1.5"], "--gamma must be from 0 to 1, got 1.5"),
+        (["--end-e=-0.1"], "--end-e must be from 0 to 1, got -0.1"),
+        (["--polyak=1.01"], "--polyak must be from 0 to 1, got 1.01"),
+        (["--td-lambda=2"], "--td-lambda must be from 0 to 1, got 2.0"),
+        (["--hysteresis=-1"], "--hysteresis must be from 0 to 1, got -1.0"),
+        (["--learning-rate=-1"], "--learning-rate must be from 0 to 1, got -1.0"),
+        (["--learning-rate=nan"], "--learning-rate must be from 0 to 1, got nan"),
+        (["--learning-rate-end=-1"], "--learning-rate-end must be from 0 to 1, got -1.0"),
+        (["--reward-scale=-1"], "--reward-scale must be from 0 to inf, got -1.0"),
+        (["--max-grad-norm=nan"], "--max-grad-norm must be from 0 to inf, got nan"),
+        (["--checkpoint-frequency=-1"], "--checkpoint-frequency must be from 0 to inf, got -1.0"),
+        (["--batch-size=0"], "--batch-size must be from 1 to inf, got 0"),
+        (["--num-envs=0"], "--num-envs must be from 1 to inf, got 0"),
+        (["--window=0"], "--window must be from 1 to inf, got 0"),
+        (["--seed=-1"], "--seed must be from 0 to inf, got -1"),
+        (["--learning-starts=-1"], "--learning-starts must be from 0 to inf, got -1"),
+        (["--resume=nowhere"], "cannot read nowhere/checkpoint.pt: "),
+        (["--resume=nowhere", "--gamma=0.5"], "no other flag can be given with it"),
+        (["--env=bp-10", "--resume=nowhere"], "no other flag can be given with it"),
+        (["--resume=nowhere", "--track"], "no other flag can be given with it"),
+        (["--resume=nowhere", "elsewhere"], "no other flag can be given with it"),
     ],
 )
-def test_bad_arguments_are_told_in_one_line(tmp_path, arguments, message):
+def test_bad_arguments_are_told_in_one_line(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
-        args = parse_args([*arguments, f"--runs-dir={tmp_path}"])
-        train(args)
-    assert str(stopped.value).startswith("avf_qplex: ") and message in str(stopped.value)
-    assert "\n" not in str(stopped.value)
+        parse_args(arguments)
+    assert message in str(stopped.value) and one_line(str(stopped.value))
     assert not any(tmp_path.iterdir()), "nothing was written"
 
 
-def test_unwritable_runs_folder(tmp_path):
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_script_checks_its_arguments(script):
+    module = importlib.import_module(script)
+    for field, value in module.Args.__dataclass_fields__.items():
+        if value.type in (int, float, float | None):
+            with pytest.raises(SystemExit, match=f"--{field.replace('_', '-')} must be from [01] to (1|inf), got -2"):
+                module.Args(**{field: value.type(-2) if value.type in (int, float) else -2.0})
+    for env_id in ("bp-10", "wtd-s", "ct-10"):
+        assert module.parse_args([f"--env={env_id}", "--seed=0"]) == args_for(module, env_id, seed=0)
+    for family, changes in module.DEFAULTS.items():
+        assert set(changes) <= set(module.Args.__dataclass_fields__), family
+
+
+def test_unknown_flags_and_values_are_refused(capsys):
+    for arguments in (["--gama=0.9"], ["--evaluate=x"], ["--device=abacus"], ["--batch-size=many"], ["bp-10"]):
+        with pytest.raises(SystemExit) as stopped:
+            parse_args(arguments)
+        assert stopped.value.code == 2 and not capsys.readouterr().out
+    if not torch.cuda.is_available():
+        with pytest.raises(SystemExit, match="--device cuda: there is none"):
+            parse_args(["--device=cuda"])
+
+
+def test_help_shows_the_defaults_in_force(capsys):
+    for env_id in ("bp-10", "wtd-s", "ct-10"):
+        with pytest.raises(SystemExit) as stopped:
+            parse_args(["--env", env_id, "--help"])
+        text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert stopped.value.code == 0 and "discount per environment step, in [0, 1]" in text
+        for name in ("gamma", "buffer_size", "td_lambda", "train_frequency"):
+            value = getattr(args_for(avf_qplex, env_id), name)
+            assert f"--{name.replace('_', '-')}" in text and f"(default: {value})" in text, (env_id, name)
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    """In a process of its own: exit code 1, one line, no traceback."""
     (tmp_path / "file").write_text("kept")
-    with pytest.raises(SystemExit, match="cannot write to --runs-dir"):
-        train(Args(runs_dir=str(tmp_path / "file")))
+    process = start("avf_qplex", f"--runs-dir={tmp_path / 'file'}")
+    printed, errors = process.communicate(timeout=60)
+    assert process.returncode == 1 and not printed and one_line(errors) and str(tmp_path / "file") in errors
     assert (tmp_path / "file").read_text() == "kept"
 
 
-def test_folders_of_other_runs_are_refused(tmp_path):
-    folder = train(defaults("wtd-s", runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 400}))
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    for arguments, message in (
-        (["--env=bp-10"], f"--env bp-10 does not fit: {folder} is a run with wtd-s"),
-        (["--gamma=0.5"], "--gamma 0.5 does not fit"),
-        (["--seed=8"], "--seed 8 does not fit"),
-    ):
-        with pytest.raises(SystemExit, match=re.escape(message)):
-            parse_args([f"--resume={folder}", *arguments])
-    (folder / "args.json").write_text((folder / "args.json").read_text().replace("avf_qplex", "avf_other", 1))
-    with pytest.raises(SystemExit, match="is a run of avf_other, not of avf_qplex"):
-        parse_args([f"--evaluate={folder}"])
-    (folder / "args.json").write_bytes(before["args.json"])
-    (folder / "checkpoint.pt").write_bytes(before["checkpoint.pt"][:1000])
-    with pytest.raises(SystemExit, match=r"checkpoint\.pt is damaged"):
-        train(parse_args([f"--resume={folder}", "--total-timesteps=800"]))
-    (folder / "model.pt").unlink()
-    with pytest.raises(SystemExit, match=r"there is no model\.pt"):
-        report(parse_args([f"--evaluate={folder}"]))
-    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "checkpoint.pt"} == {
-        name: content for name, content in before.items() if name not in ("checkpoint.pt", "model.pt")
-    }
+def test_other_runs_and_damaged_checkpoints_are_refused(tmp_path, monkeypatch):
+    folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY), stop_in(monkeypatch, avf_qplex, 3))
+    path = folder / "checkpoint.pt"
+    whole = path.read_bytes()
+    args = load(path)["args"]
+    torch.save({"algorithm": "avf_vdn", "args": args}, path)
+    code, message = run_as_program(monkeypatch, f"--resume={folder}")
+    assert code == 1 and message == f"{path} is of avf_vdn, not of avf_qplex"
+    damaged = [whole[:1000], whole[:-100], b"\x80", b"text\n", whole[: len(whole) // 2] + bytes(2000), bytes(99)]
+    torch.save({"step": 3}, path)  # of something else
+    damaged.append(path.read_bytes())
+    for content in damaged:
+        path.write_bytes(content)
+        code, message = run_as_program(monkeypatch, f"--resume={folder}")
+        assert code == 1 and one_line(message) and message.startswith(f"cannot read {path}: "), content[:20]
+        assert path.read_bytes() == content and not (folder / "last.pt").exists()
+    path.unlink()
+    code, message = run_as_program(monkeypatch, f"--resume={folder}")
+    assert code == 1 and one_line(message) and message.startswith(f"cannot read {path}: ")
+    path.write_bytes(whole)
+    assert run_as_program(monkeypatch, f"--resume={folder}")[0] == 0
 
 
-def test_track_copies_the_curves(tmp_path, monkeypatch):
-    """With a stand-in for wandb, which is optional: what it is told, and the one line where it is missing."""
-    calls = []
-    tracker = types.SimpleNamespace(finish=lambda: calls.append("finish"))
-    module = types.ModuleType("wandb")
-    module.init = lambda **options: calls.append(options) or tracker
-    module.__spec__ = importlib.util.spec_from_loader("wandb", loader=None)
-    monkeypatch.setitem(sys.modules, "wandb", module)
-    options = {**TINY, "total_timesteps": 400, "runs_dir": str(tmp_path), "track": True, "wandb_project_name": "mine"}
-    folder = train(defaults("wtd-s", **options))
-    train(parse_args([f"--resume={folder}", "--total-timesteps=800"]))
-    told, finished, again, _ = calls
-    assert finished == "finish" and told["project"] == "mine" and told["sync_tensorboard"] and told["config"]["track"]
-    assert told["id"] == again["id"] == folder.name and told["resume"] == "allow"
-    monkeypatch.undo()
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SystemExit, match=re.escape("--track needs Weights & Biases: pip install -e '.[track]'")):
-        train(defaults("wtd-s", **options))
-    assert len(list(tmp_path.iterdir())) == 1
+def test_an_empty_checkpoint_is_refused(tmp_path):
+    """What a power cut may leave behind."""
+    (tmp_path / "checkpoint.pt").touch()
+    with pytest.raises(SystemExit, match="cannot read"):
+        parse_args([f"--resume={tmp_path}"])
 
 
-def test_help_shows_the_defaults_in_force():
-    for env_id in ("bp-10", "wtd-s", "ct-10"):
-        process = start("--env", env_id, "--help")
-        output, _ = process.communicate(timeout=60)
-        text = " ".join(output.replace("│", " ").split())
-        for name in ("gamma", "buffer_size", "td_lambda", "train_frequency"):
-            value = getattr(defaults(env_id), name)
-            assert f"--{name.replace('_', '-')}" in text and f"(default: {value})" in text, (env_id, name)
-    for family, changes in avf_qplex.DEFAULTS.items():
-        assert set(changes) <= set(Args.__dataclass_fields__), family
+class Malicious:
+    def __init__(self, victim):
+        self.victim = victim
+
+    def __reduce__(self):
+        return Path.touch, (self.victim,)
 
 
-def test_checkpoints_replace_the_old_one_at_once(tmp_path, monkeypatch):
-    """A failure while writing leaves the old checkpoint whole."""
-    path = tmp_path / "checkpoint.pt"
-    saved = {"run": ["avf_qplex", "wtd-s"], "step": 1}
-    avf_qplex.save(saved, path)
+def test_loading_runs_no_code(tmp_path):
+    folder, victim = tmp_path / "run", tmp_path / "victim"
+    folder.mkdir()
+    content = {"algorithm": "avf_qplex", "args": {}, "parts": Malicious(victim)}
+    torch.save(content, folder / "checkpoint.pt")
+    with pytest.raises(SystemExit) as stopped:
+        parse_args([f"--resume={folder}"])
+    assert one_line(str(stopped.value)) and "cannot read" in str(stopped.value) and not victim.exists()
+    torch.load(folder / "checkpoint.pt", weights_only=False)
+    assert victim.exists(), "the file is as malicious as it looks"
 
-    def broken(saved, file):
+
+def test_files_are_whole_or_not_there(tmp_path, monkeypatch):
+    """A failure while writing leaves the old model or checkpoint whole, and no half of an args.json."""
+    path, args = tmp_path / "checkpoint.pt", Args()
+    save(path, args, step=1)
+
+    def broken(content, file):
         Path(file).write_bytes(b"half")
         raise OSError("disk full")
 
     monkeypatch.setattr(torch, "save", broken)
     with pytest.raises(OSError, match="disk full"):
-        avf_qplex.save({"step": 2}, path)
-    assert avf_qplex.load_file(tmp_path, "checkpoint.pt", "wtd-s") == saved
-    with pytest.raises(SystemExit, match="is of avf_qplex on wtd-s, not of avf_qplex on bp-10"):
-        avf_qplex.load_file(tmp_path, "checkpoint.pt", "bp-10")
+        save(path, args, step=2)
+    monkeypatch.undo()
+    assert load(path)["step"] == 1 and Args(**load(path)["args"]) == args
+    save(path, args, step=3)
+    assert load(path)["step"] == 3 and [p.name for p in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+    write = Path.write_text
+
+    def full(self, text):
+        write(self, text[: len(text) // 2])
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="disk full"):
+        train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path / "runs"), **TINY))
+    assert not any(tmp_path.glob("runs/*/args.json"))
+
+
+def test_track_copies_the_curves(tmp_path, monkeypatch):
+    """With a stand-in for wandb, which is optional: what it is told, and the one line where it is missing."""
+    calls, module = [], types.ModuleType("wandb")
+    module.init = lambda **options: calls.append(options)
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), track=True, **TINY)
+    folder = train(args, stop_in(monkeypatch, avf_qplex, 10))
+    train(parse_args([f"--resume={folder}"]))
+    told, again = calls
+    assert told["sync_tensorboard"] and told["config"]["track"] and told["config"]["env"] == "bp-10"
+    assert told["id"] == told["name"] == again["id"] == folder.name and told["resume"] == again["resume"] == "allow"
+    monkeypatch.setitem(sys.modules, "wandb", None)  # as if it were not installed
+    code, message = run_as_program(monkeypatch, "--track", f"--runs-dir={tmp_path}")
+    assert code == 1 and one_line(message) and "wandb" in message and len(list(tmp_path.iterdir())) == 1
