@@ -373,8 +373,8 @@ def train(args, stop=()):
         state = infos["state"]
         buffer.add(obs, actions, infos["macro_done"], state)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over, discounts = terminations | truncations, args.gamma * ~terminations
-        buffer.step(state, args.reward_scale * rewards, discounts, over, obs, infos)
+        over = terminations | truncations
+        buffer.step(state, args.reward_scale * rewards, args.gamma * ~terminations, over, obs, infos)
         step += args.num_envs
         bar.update(args.num_envs)
         if over.any():

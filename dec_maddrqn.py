@@ -331,8 +331,8 @@ def train(args, stop=()):
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         buffer.add(obs, actions, infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over, discounts = terminations | truncations, args.gamma * ~terminations
-        buffer.step(args.reward_scale * rewards, discounts, over, obs, infos)
+        over = terminations | truncations
+        buffer.step(args.reward_scale * rewards, args.gamma * ~terminations, over, obs, infos)
         step += args.num_envs
         bar.update(args.num_envs)
         if over.any():

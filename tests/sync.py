@@ -40,7 +40,7 @@ GROUPS = {
 OWN_LINES = [
     r'state = infos\["state"\]',
     r'buffer\.add\(obs, actions, infos\["macro_done"\](, state)?\)',
-    r"buffer\.step\((state, )?args\.reward_scale \* rewards, discounts, over, obs, infos\)",
+    r"buffer\.step\((state, )?args\.reward_scale \* rewards, args\.gamma \* ~terminations, over, obs, infos\)",
     r"batch = (team_batch\()?buffer\.sample\(args\.batch_size, args\.window, (args\.mixer_state, )?rng, args\.device\)"
     r"(, agents\))?",
     r'loss, (joint_q, _|q, _, _) = (td|own)_loss\(\*utilities, (learner\["mixer"\], target\["mixer"\], )?batch, '
