@@ -231,13 +231,12 @@ def td_loss(utilities, target_utilities, batch, td_lambda=0.0, hysteresis=1.0):
         best_q = target_utilities.gather(3, best[..., None])[..., 0]  # [B, T, n]
         bootstrap = mix(best_q[there])  # [R]
         following = torch.zeros_like(batch["reward"]).masked_scatter(here, bootstrap)  # [B, T]
-        share = td_lambda * here.roll(-1, 1)  # [B, T], the return of a window's last row has no further one in it
-        columns = (x.unbind(1) for x in (batch["reward"], batch["discount"], following, share))
-        returns = [bootstrap.new_zeros(len(here))]  # the last first: [B] each
-        for reward, discount, value, part in reversed(list(zip(*columns, strict=True))):
-            # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
-            returns.append(reward + discount * torch.lerp(value, returns[-1], part))
-        target = torch.stack(returns[:0:-1], 1)[here]  # [R]
+        returns = list((batch["reward"] + batch["discount"] * following).unbind(1))  # one-row ones, [B] each
+        longer = (td_lambda * batch["discount"] * here.roll(-1, 1)).unbind(1)  # none beyond a window's last row
+        # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
+        for k in reversed(range(len(returns) - 1) if td_lambda else ()):
+            returns[k] = torch.addcmul(returns[k], longer[k], returns[k + 1] - following[:, k])
+        target = torch.stack(returns, 1)[here]  # [R]
     error = target - q
     return torch.where(error < 0, hysteresis * error, error).square().mean(), q, target
 
