@@ -56,8 +56,9 @@ class Args:
 
     # Algorithm
     learning_rate: float = 5e-4  # Adam's step size
-    learning_rate_end: float | None = None  # step size at total_timesteps, reached linearly; None keeps it constant
-    gamma: float = 0.99  # discount per environment step, in [0, 1]
+    learning_rate_end: float = 1.0  # share of the step size left at total_timesteps, reached linearly
+    gamma: float = 0.99  # discount factor, in [0, 1]
+    discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
     buffer_size: int = 2_500  # episodes in the replay buffer
     batch_size: int = 64  # windows in an update
     window: int = 25  # consecutive rows in a window
@@ -200,15 +201,16 @@ class ReplayBuffer:
     def __init__(self, env, capacity):
         (n, d), state = env.single_observation_space.shape, (env.state_size,)
         fields = {
-            "obs": ((n, d), np.float32),  # what every agent last saw
-            "action": ((n,), np.int64),  # the macro-action that it runs
-            "since": ((n,), np.int64),  # and since which row: its macro-history moves where that is this one
-            "state": (state, np.float32),
-            "real": (state, np.float32),  # the state a step before the next row
-            "reward": ((), np.float32),  # sum of gamma^t r_t until the next row
-            "discount": ((), np.float32),  # gamma^tau, 0 where the episode terminated
+            "obs": (n, d),  # what every agent last saw
+            "action": (n,),  # the macro-action that it runs
+            "since": (n,),  # and since which row: its macro-history moves where that is this one
+            "state": state,
+            "real": state,  # the state a step before the next row
+            "reward": (),  # sum of gamma^t r_t until the next row
+            "discount": (),  # gamma^tau, 0 where the episode terminated
         }
-        for name, (shape, kind) in fields.items():
+        for name, shape in fields.items():
+            kind = np.int64 if name in ("action", "since") else np.float32
             setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
         self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
         self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
@@ -335,6 +337,7 @@ def train(args, stop=()):
     fast, slow = list(learner.parameters()), list(target.parameters())
     optimizer = torch.optim.Adam(fast, lr=args.learning_rate, fused=True)
     buffer = ReplayBuffer(env, args.buffer_size)
+    step_gamma, row_gamma = (args.gamma, 1.0) if args.discount == "step" else (1.0, args.gamma)
     obs, infos = env.reset(seed=args.seed)
     hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
     folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
@@ -364,16 +367,15 @@ def train(args, stop=()):
 
     while step < args.total_timesteps:
         # Choose and step
-        progress, done = step / args.exploration_timesteps, step / args.total_timesteps
-        epsilon = np.interp(progress, [0, 1], [1.0, args.end_e])
-        if args.learning_rate_end is not None:
-            optimizer.param_groups[0]["lr"] = (1 - done) * args.learning_rate + done * args.learning_rate_end
+        epsilon = np.interp(step, [0, args.exploration_timesteps], [1.0, args.end_e])
+        lr_share = np.interp(step, [0, args.total_timesteps], [1.0, args.learning_rate_end])
+        optimizer.param_groups[0]["lr"] = lr_share * args.learning_rate
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.add(obs, actions, infos["macro_done"], state)
         obs, rewards, terminations, truncations, infos = env.step(actions)
         over = terminations | truncations
-        buffer.step(state, args.reward_scale * rewards, args.gamma * ~terminations, over, obs, infos)
+        buffer.step(state, args.reward_scale * rewards, step_gamma * ~terminations, over, obs, infos)
         step += args.num_envs
         bar.update(args.num_envs)
         if over.any():
@@ -384,8 +386,9 @@ def train(args, stop=()):
         # Learn
         while updates < (step - args.learning_starts) // args.train_frequency and buffer.rows[buffer.queue].any():
             batch = buffer.sample(args.batch_size, args.window, args.mixer_state, rng, args.device)
+            batch["discount"] *= row_gamma
             utilities = over_rows(batch, agents, target["agents"])
-            beta = np.interp(progress, [1, 2], [args.hysteresis, 1.0])  # optimistic while the others explore
+            beta = np.interp(step / args.exploration_timesteps, [1, 2], [args.hysteresis, 1.0])
             loss, joint_q, _ = td_loss(*utilities, learner["mixer"], target["mixer"], batch, args.td_lambda, beta)
             optimizer.zero_grad()
             loss.backward()

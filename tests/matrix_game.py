@@ -1,4 +1,4 @@
-"""A two-agent matrix game whose macro-actions have different lengths, for tests of what a learner can represent."""
+"""Small games of two agents, for tests of what a learner can represent and of what it values."""
 
 import numpy as np
 
@@ -43,6 +43,35 @@ class MatrixGame(MacroVectorEnv):
             return step
         chosen = np.eye(3, dtype=np.float32)[self.first_choice].reshape(self.num_envs, 6)
         return np.concatenate([step, chosen * (self.elapsed > 0)[:, None]], 1)
+
+    def _draw(self, index):
+        raise NotImplementedError
+
+
+class WaitingGame(MacroVectorEnv):
+    """Agent 0 stands below a big box: it pushes, or leaves for a safe one. A partner who plays at random, and whom no
+    observation and no state shows, joins a push with probability `joins`: the box moves, which ends the episode and
+    pays `big`; else the push costs `fails` and can be tried again. Leaving ends the episode and pays `safe`. Agent 1
+    only watches: its macro-actions, one step long, do nothing."""
+
+    def __init__(self, num_envs=1, joins=0.1, big=8.0, fails=1.0, safe=2.0, render_mode=None):
+        names = [["push", "leave"]] * 2
+        super().__init__(num_envs, names, np.zeros((2, 1)), np.ones((2, 1)), (1, 1), 1, 50, render_mode)
+        self.joins, self.big, self.fails, self.safe = joins, big, fails, safe
+
+    def _reset(self, mask):
+        pass
+
+    def _advance(self):
+        pushes, joins = self.macro_action[:, 0] == 0, self.np_random.random(self.num_envs) < self.joins
+        rewards = np.where(pushes, np.where(joins, self.big, -self.fails), self.safe)
+        return rewards, ~pushes | joins, np.ones((self.num_envs, 2), bool), pushes & joins
+
+    def _observe(self, start):
+        return np.ones((self.num_envs, 2, 1), np.float32)
+
+    def _state(self):
+        return np.ones((self.num_envs, 1), np.float32)
 
     def _draw(self, index):
         raise NotImplementedError

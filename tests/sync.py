@@ -40,7 +40,7 @@ GROUPS = {
 OWN_LINES = [
     r'state = infos\["state"\]',
     r'buffer\.add\(obs, actions, infos\["macro_done"\](, state)?\)',
-    r"buffer\.step\((state, )?args\.reward_scale \* rewards, args\.gamma \* ~terminations, over, obs, infos\)",
+    r"buffer\.step\((state, )?args\.reward_scale \* rewards, step_gamma \* ~terminations, over, obs, infos\)",
     r"batch = (team_batch\()?buffer\.sample\(args\.batch_size, args\.window, (args\.mixer_state, )?rng, args\.device\)"
     r"(, agents\))?",
     r'loss, (joint_q, _|q, _, _) = (td|own)_loss\(\*utilities, (learner\["mixer"\], target\["mixer"\], )?batch, '
@@ -51,14 +51,14 @@ OWN_LINES = [
 IAICC_LINES = [
     r"target, agents = copy\.deepcopy\(learner(\[\"critics\"\])?\)\.requires_grad_\(False\), learner\[\"agents\"\]",
     r"buffer = (ReplayBuffer\(env, args\.buffer_size\)|EpisodeBuffer\(env, args\.batch_size \+ args\.num_envs\))",
-    r"epsilon = np\.interp\(progress, \[0, 1\], \[(1\.0|args\.start_e), args\.end_e\]\)",
+    r"epsilon = np\.interp\(step, \[0, args\.exploration_timesteps\], \[(1\.0|args\.start_e), args\.end_e\]\)",
     r"# Learn( from the episodes that ended, once)?",
     r"while updates < \(step - args\.learning_starts\) // args\.train_frequency "
     r"and buffer\.rows\[buffer\.queue\]\.any\(\):",
     r"if np\.count_nonzero\(buffer\.rows\[buffer\.queue\]\) >= args\.batch_size:",
     r"batch = buffer\.take\(args\.device\)",
     r'utilities = over_rows\(batch, agents, target\["agents"\]\)',
-    r"beta = np\.interp\(progress, \[1, 2\], \[args\.hysteresis, 1\.0\]\)  # .*",
+    r"beta = np\.interp\(step / args\.exploration_timesteps, \[1, 2\], \[args\.hysteresis, 1\.0\]\)",
     r"joint = joint_batch\(batch, max\(env\.n_actions\)\)",
     r'values, target_values = \(x\[\.\.\., 0\] for x in over_rows\(joint, learner\["critics"\], target\)\)  # .*',
     r"policy = soft_policy\(over_rows\(batch, agents\)\[0\], epsilon\)  # .*",

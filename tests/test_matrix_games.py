@@ -23,7 +23,7 @@ import dec_maddrqn
 import envs
 import mac_iaicc
 from tests.curves import scalars
-from tests.matrix_game import MatrixGame
+from tests.matrix_game import MatrixGame, WaitingGame
 
 ADDITIVE = np.add.outer([0.0, 3.0, 1.0], [2.0, 0.0, 5.0])  # best (b, c): 8
 MONOTONIC = np.array([(8.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])  # both are needed
@@ -171,5 +171,38 @@ def test_independent_learners_average_over_the_other(play):
 def test_actors_and_critics_find_the_optimum(play, game):
     """On policy: agent 1's a is best as long as agent 0 sometimes takes a, and then so is a for agent 0."""
     settings = dict(total_timesteps=15_000, batch_size=16, exploration_timesteps=10_000, learning_rate=2e-3)
-    settings["learning_rate_end"] = None
+    settings["learning_rate_end"] = 1.0
     assert play(mac_iaicc, game, reward_scale=0.1, **settings)[0] == 8
+
+
+@pytest.mark.parametrize("script", [avf_vdn, avf_qmix, avf_qplex], ids=lambda s: s.__name__)
+def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch, tmp_path):
+    """Beside a random partner the value e of pushing is where the weights of errors balance (docs/defaults.md):
+    joins (big - e) = beta^2 (1 - joins) (e - (gamma max(e, safe) - fails)), above `safe` for beta below a bound."""
+    game, gamma = dict(joins=0.1, big=10.0, fails=3.0, safe=2.0), 0.9
+    p, big, fails, safe = game.values()
+    bound = (p / (1 - p) * (big - safe) / (fails + (1 - gamma) * safe)) ** 0.5
+    assert bound == pytest.approx(0.527, abs=1e-3)
+    monkeypatch.setitem(envs._TASKS, "waiting", (WaitingGame, game))
+    monkeypatch.setattr(envs, "IDS", (*envs.IDS, "waiting"))
+    td_loss, found = script.td_loss, {}
+
+    def recording(*args):
+        loss, q, target = td_loss(*args)
+        (batch,) = (x for x in args if isinstance(x, dict))
+        pushes = batch["action"][..., 0][batch["valid"]] == 0
+        found[beta].append([q[pushes].mean().item(), q[~pushes].mean().item()])
+        return loss, q, target
+
+    monkeypatch.setattr(script, "td_loss", recording)
+    shared = dict(env="waiting", seed=SEED, runs_dir=str(tmp_path), gamma=gamma, hidden_size=16, eval_episodes=1,
+                  total_timesteps=8_000, learning_starts=1_600, train_frequency=16, end_e=1.0, batch_size=64, window=4,
+                  polyak=0.95, learning_rate=5e-3, learning_rate_end=0.0, exploration_timesteps=10**6)  # fmt: skip
+    for beta in (0.3, 1.0):
+        found[beta] = []
+        script.train(dataclasses.replace(script.parse_args(["--env=wtd-s"]), hysteresis=beta, **shared))
+        push, leave = np.mean(found[beta][-100:], 0)
+        weight = beta**2 * (1 - p)
+        again = (p * big - weight * fails) / (p + weight * (1 - gamma))  # where pushing goes on, else safe follows
+        expected = again if beta < bound else (p * big + weight * (gamma * safe - fails)) / (p + weight)
+        assert push == pytest.approx(expected, abs=1) and leave == pytest.approx(safe, abs=0.3)

@@ -197,6 +197,29 @@ def test_a_finished_run(tmp_path, monkeypatch, capsys):
     assert code == 1 and one_line(message) and message.startswith(f"cannot read {folder}/checkpoint.pt: ")
 
 
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_discount_for_each_step_or_once_a_row(tmp_path, monkeypatch, script):
+    """What is learned from: gamma^tau and rewards discounted within a row, or gamma and their sum."""
+    module = importlib.import_module(script)
+    over_rows, rows = module.over_rows, {}
+
+    def spy(batch, *networks):
+        if "reward" in batch:  # not the critics' joint batch of mac_iaicc
+            rows[discount] += torch.stack([batch["discount"], batch["reward"]], 2)[batch["valid"]].tolist()
+        return over_rows(batch, *networks)
+
+    monkeypatch.setattr(module, "over_rows", spy)
+    options = {key: value for key, value in TINY.items() if hasattr(module.Args, key)} | dict(gamma=0.9, reward_scale=1)
+    for discount in ("step", "decision"):
+        rows[discount] = []
+        module.train(args_for(module, "bp-10", runs_dir=str(tmp_path), discount=discount, **options))
+    walks = [row for row in rows["step"] if row[0] < 0.9 and -1 < row[1] < 0]  # some steps at -0.1, nothing else
+    assert walks and all(reward == pytest.approx(once - 1, abs=1e-5) for once, reward in walks)
+    walks = [row for row in rows["decision"] if -1 < row[1] < 0]
+    assert min(reward for _, reward in walks) < -0.25 and all(once == pytest.approx(0.9) for once, _ in walks)
+    assert all(reward * 10 == pytest.approx(round(reward * 10), abs=1e-4) for _, reward in walks)
+
+
 def test_what_is_logged(tmp_path):
     """Of training every 2,000 steps, of the loss every 100 updates, and evaluations at the end in any case."""
     options = {**TINY, "total_timesteps": 4_100, "train_frequency": 20, "learning_starts": 2_000}
