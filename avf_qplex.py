@@ -44,7 +44,7 @@ ALGORITHM = Path(__file__).stem
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS
     seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
-    total_timesteps: int = 400_000  # environment steps of the run, over all environments
+    total_timesteps: int = 300_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
@@ -55,23 +55,23 @@ class Args:
     track: bool = False  # log to Weights & Biases too, which takes project and entity from its environment variables
 
     # Algorithm
-    learning_rate: float = 5e-4  # Adam's step size
-    learning_rate_end: float = 1.0  # share of the step size left at total_timesteps, reached linearly
+    learning_rate: float = 1e-3  # Adam's step size
+    learning_rate_end: float = 0.0  # share of the step size left at total_timesteps, reached linearly
     gamma: float = 0.99  # discount factor, in [0, 1]
     discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
     buffer_size: int = 2_500  # episodes in the replay buffer
-    batch_size: int = 64  # windows in an update
-    window: int = 25  # consecutive rows in a window
+    batch_size: int = 32  # windows in an update
+    window: int = 50  # consecutive rows in a window
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
-    end_e: float = 0.05  # exploration rate from exploration_timesteps on
-    exploration_timesteps: int = 300_000  # environment steps over which the exploration rate falls from 1, linearly
-    learning_starts: int = 5_000  # environment steps before the first update
+    learning_starts: int = 5_000  # environment steps at random before the first update
+    exploration_timesteps: int = 150_000  # steps after these over which the exploration rate falls from 1, linearly
+    end_e: float = 0.05  # exploration rate from then on
     train_frequency: int = 64  # environment steps per gradient update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
-    reward_scale: float = 1.0  # factor on rewards inside the loss; logged returns are unscaled
+    reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.0  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors, 1 from 2 * exploration_timesteps on; 1 is the paper's loss
+    hysteresis: float = 1.0  # factor on negative TD errors while exploring, 1 from twice as many steps on; 1: none
     hidden_size: int = 64  # width of the agents' layers
     mixer_state: Literal["joint", "single", "real", "decision"] = "joint"  # what it sees, see ReplayBuffer.sample
     mask_ongoing: bool = True  # ongoing agents have advantage 0 (deviation 1)
@@ -87,12 +87,13 @@ class Args:
                 raise SystemExit(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
 
 
-# Where the environment families need other values; docs/defaults.md says how they were chosen.
+# Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(total_timesteps=600_000, gamma=0.95, learning_rate=3e-4, td_lambda=0.5, hysteresis=0.1),
-    "ct": dict(total_timesteps=600_000, num_envs=128, learning_rate=1e-3, learning_rate_end=0.0, gamma=0.9,
-               buffer_size=5_000, exploration_timesteps=150_000, train_frequency=256, obs_scale=4.0, reward_scale=10.0,
-               td_lambda=0.8, hidden_size=32, eval_frequency=40_000, eval_episodes=400),
+    "bp": dict(total_timesteps=500_000, learning_rate=5e-4, gamma=0.95, discount="decision", learning_starts=200_000,
+               exploration_timesteps=100_000, td_lambda=0.5, hysteresis=0.1),
+    "wtd-t": dict(total_timesteps=800_000, exploration_timesteps=200_000),
+    "ct": dict(total_timesteps=600_000, num_envs=128, gamma=0.9, buffer_size=5_000, train_frequency=256, obs_scale=4.0,
+               reward_scale=10.0, td_lambda=0.8, hidden_size=32, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip
 
 
@@ -210,7 +211,7 @@ class ReplayBuffer:
             "discount": (),  # gamma^tau, 0 where the episode terminated
         }
         for name, shape in fields.items():
-            kind = np.int64 if name in ("action", "since") else np.float32
+            kind = int if name in ("action", "since") else np.float32
             setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
         self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
         self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
@@ -240,8 +241,7 @@ class ReplayBuffer:
         Every row is as likely as any other: windows reach over both ends of an episode and are cut there. mixer_state:
         "joint", of the rows since which agents run their macro-actions (macro-states); "single", that of one whose
         macro-action ends with the row's interval; "real", of the interval's last step; "decision", of the row."""
-        ended = self.queue[self.rows[self.queue] > 0]
-        episode = ended[rng.integers(len(ended), size=(batch_size, 1))]
+        episode = rng.choice(self.queue[self.rows[self.queue] > 0], (batch_size, 1))
         last = self.rows[episode] - 1  # [B, 1], the row of the final observation
         start = rng.integers(1 - window, last)
         end = np.minimum(start + window, last)
@@ -359,7 +359,7 @@ def train(args, stop=()):
         (folder / "args.json.new").replace(folder / "args.json")
     writer = SummaryWriter(folder, purge_step=step + 1)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
-    started, first_step, saved_at = time.time(), step, time.time()
+    time0, step0, saved_at = time.time(), step, time.time()
 
     def log(group, **values):
         for key, value in values.items():
@@ -367,7 +367,7 @@ def train(args, stop=()):
 
     while step < args.total_timesteps:
         # Choose and step
-        epsilon = np.interp(step, [0, args.exploration_timesteps], [1.0, args.end_e])
+        epsilon = np.interp(step - args.learning_starts, [0, args.exploration_timesteps], [1.0, args.end_e])
         lr_share = np.interp(step, [0, args.total_timesteps], [1.0, args.learning_rate_end])
         optimizer.param_groups[0]["lr"] = lr_share * args.learning_rate
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
@@ -388,7 +388,7 @@ def train(args, stop=()):
             batch = buffer.sample(args.batch_size, args.window, args.mixer_state, rng, args.device)
             batch["discount"] *= row_gamma
             utilities = over_rows(batch, agents, target["agents"])
-            beta = np.interp(step / args.exploration_timesteps, [1, 2], [args.hysteresis, 1.0])
+            beta = np.interp((step - args.learning_starts) / args.exploration_timesteps, [1, 2], [args.hysteresis, 1.0])
             loss, joint_q, _ = td_loss(*utilities, learner["mixer"], target["mixer"], batch, args.td_lambda, beta)
             optimizer.zero_grad()
             loss.backward()
@@ -401,8 +401,7 @@ def train(args, stop=()):
 
         # Log, evaluate, save
         if step % 2_000 < args.num_envs and recent:
-            sps = (step - first_step) / (time.time() - started)
-            log("charts", SPS=sps, epsilon=epsilon, episodic_return=np.mean(recent))
+            log("charts", SPS=(step - step0) / (time.time() - time0), epsilon=epsilon, episodic_return=np.mean(recent))
             recent = []
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
             seed = args.seed * 10**9 + step  # fresh episodes
@@ -451,7 +450,7 @@ def load(path):
 
 
 def parse_args(argv=None):
-    """Args from the command line, over the defaults of the task's family or the settings of the run to go on with."""
+    """Args from the command line, over the defaults of the task or the settings of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
@@ -461,7 +460,8 @@ def parse_args(argv=None):
     if known.resume:
         return Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
     env = known.env or Args.env
-    args = tyro.cli(Args, default=Args(env=env, **DEFAULTS.get(env.split("-")[0], {})), args=argv)
+    defaults = next((row for start, row in DEFAULTS.items() if env.startswith(start)), {})
+    args = tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
     if args.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("--device cuda: there is none")
     return args

@@ -67,8 +67,8 @@ class Args:
     n_step: int = 5  # macro-actions of an agent in its return before its target critic takes over
     polyak: float = 0.95  # share of the target critics kept at each update; higher is slower
     start_e: float = 0.5  # share of uniform macro-actions in the policies at the start
-    end_e: float = 0.01  # that share from exploration_timesteps on
     exploration_timesteps: int = 200_000  # environment steps over which the share falls linearly
+    end_e: float = 0.01  # that share from exploration_timesteps on
     entropy_coef: float = 0.01  # weight of the policies' entropy in the loss; bigger explores longer
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
@@ -86,7 +86,7 @@ class Args:
                 raise SystemExit(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
 
 
-# Where the environment families need other values; docs/defaults.md says how they were chosen.
+# Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
     "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000, gamma=0.95),
     "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, batch_size=32,
@@ -188,7 +188,7 @@ class EpisodeBuffer:
             "discount": (),  # gamma^tau, 0 where the episode terminated
         }
         for name, shape in fields.items():
-            kind = np.int64 if name in ("action", "since") else np.float32
+            kind = int if name in ("action", "since") else np.float32
             setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
         self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
         self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
@@ -338,7 +338,7 @@ def train(args, stop=()):
         (folder / "args.json.new").replace(folder / "args.json")
     writer = SummaryWriter(folder, purge_step=step + 1)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
-    started, first_step, saved_at = time.time(), step, time.time()
+    time0, step0, saved_at = time.time(), step, time.time()
 
     def log(group, **values):
         for key, value in values.items():
@@ -384,8 +384,7 @@ def train(args, stop=()):
 
         # Log, evaluate, save
         if step % 2_000 < args.num_envs and recent:
-            sps = (step - first_step) / (time.time() - started)
-            log("charts", SPS=sps, epsilon=epsilon, episodic_return=np.mean(recent))
+            log("charts", SPS=(step - step0) / (time.time() - time0), epsilon=epsilon, episodic_return=np.mean(recent))
             recent = []
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
             seed = args.seed * 10**9 + step  # fresh episodes
@@ -434,7 +433,7 @@ def load(path):
 
 
 def parse_args(argv=None):
-    """Args from the command line, over the defaults of the task's family or the settings of the run to go on with."""
+    """Args from the command line, over the defaults of the task or the settings of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
@@ -444,7 +443,8 @@ def parse_args(argv=None):
     if known.resume:
         return Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
     env = known.env or Args.env
-    args = tyro.cli(Args, default=Args(env=env, **DEFAULTS.get(env.split("-")[0], {})), args=argv)
+    defaults = next((row for start, row in DEFAULTS.items() if env.startswith(start)), {})
+    args = tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
     if args.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("--device cuda: there is none")
     return args

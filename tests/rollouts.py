@@ -1,8 +1,8 @@
 """Episodes played and logged without the replay memory, and the rows and utilities that they must give."""
 
+import dataclasses
 import inspect
 import types
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,11 +17,11 @@ TINY = dict(num_envs=4, total_timesteps=1_200, learning_starts=200, train_freque
 
 
 def args_for(script, env_id, **options):
-    """The script's Args for a task, with its family's defaults."""
-    return script.Args(**{"env": env_id, **script.DEFAULTS.get(env_id.split("-")[0], {}), **options})
+    """The script's Args for a task, with its defaults for it."""
+    return dataclasses.replace(script.parse_args([f"--env={env_id}"]), **options)
 
 
-@dataclass
+@dataclasses.dataclass
 class Step:
     """One step of one environment: what was there before it, what was done and what it paid."""
 
@@ -33,7 +33,7 @@ class Step:
     utilities: torch.Tensor  # [n, A], of every agent's latest decision
 
 
-@dataclass
+@dataclasses.dataclass
 class Episode:
     steps: list
     obs: np.ndarray  # the final one
@@ -104,10 +104,13 @@ def check_rows(buffer, place, rows):
 
 
 class Draws:
-    """Stands in for a generator whose `integers` are known: which episodes, then which first rows, [B] each."""
+    """Stands in for a generator whose draws are known: which of the episodes, then which first rows, [B] each."""
 
     def __init__(self, *draws):
         self.draws = iter(draws)
+
+    def choice(self, values, size):
+        return values[self.integers()]
 
     def integers(self, *args, **kwargs):
         return np.asarray(next(self.draws))[:, None]

@@ -95,7 +95,7 @@ def check_seeds(script, env_id, folder, tags=TAGS, **many):
 
 def check_lambda_and_hysteresis(script, name, folder, monkeypatch):
     """What training passes to the loss of this name: lambda, and a factor on negative errors that is held while
-    exploring and then let go by linear interpolation, until twice as many steps."""
+    exploring, which begins with learning, and then let go by linear interpolation, until twice as many steps."""
     acted, loss, seen = watch_play(script, script.ReplayBuffer, monkeypatch, 0.9, 0.5), getattr(script, name), []
 
     def spy_loss(utilities, target_utilities, batch, td_lambda, hysteresis):
@@ -104,10 +104,10 @@ def check_lambda_and_hysteresis(script, name, folder, monkeypatch):
         return loss(utilities, target_utilities, batch, td_lambda, hysteresis)
 
     monkeypatch.setattr(script, name, spy_loss)
-    options = dict(td_lambda=0.3, hysteresis=0.2, exploration_timesteps=400, end_e=0.1, gamma=0.9, reward_scale=0.5)
-    script.train(short(script, "bp-10", folder, **options))
-    assert acted[0] == 1.0 and acted[50] == pytest.approx(0.55) and set(acted[100:]) == {0.1}
+    options = dict(td_lambda=0.3, hysteresis=0.2, exploration_timesteps=400, end_e=0.1, gamma=0.9, discount="step")
+    script.train(short(script, "bp-10", folder, reward_scale=0.5, **options))
+    assert set(acted[:51]) == {1.0} and acted[100] == pytest.approx(0.55) and set(acted[150:]) == {0.1}
     assert len({step for step, *_ in seen}) > 15 and seen[-1][0] > 900
     for step, td_lambda, hysteresis in seen:
-        share = min(max(step / 400 - 1, 0), 1)
+        share = min(max((step + 4 - 200) / 400 - 1, 0), 1)
         assert td_lambda == 0.3 and hysteresis == pytest.approx(0.2 * (1 - share) + share)

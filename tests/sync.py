@@ -32,8 +32,7 @@ GROUPS = {
     "DEFAULTS.bp": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.ct": [Q_LEARNING, "mac_iaicc"],
     **{f"Args.{field}": [Q_LEARNING, "mac_iaicc"] for field in (  # other values, or other words
-        "learning_rate", "learning_rate_end", "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale",
-        "hidden_size")},
+        "total_timesteps", "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
 }  # fmt: skip
 
 # Lines of `train` that may differ between any two scripts: what is stored and the loss.
@@ -51,14 +50,16 @@ OWN_LINES = [
 IAICC_LINES = [
     r"target, agents = copy\.deepcopy\(learner(\[\"critics\"\])?\)\.requires_grad_\(False\), learner\[\"agents\"\]",
     r"buffer = (ReplayBuffer\(env, args\.buffer_size\)|EpisodeBuffer\(env, args\.batch_size \+ args\.num_envs\))",
-    r"epsilon = np\.interp\(step, \[0, args\.exploration_timesteps\], \[(1\.0|args\.start_e), args\.end_e\]\)",
+    r"epsilon = np\.interp\(step( - args\.learning_starts)?, \[0, args\.exploration_timesteps\], "
+    r"\[(1\.0|args\.start_e), args\.end_e\]\)",
     r"# Learn( from the episodes that ended, once)?",
     r"while updates < \(step - args\.learning_starts\) // args\.train_frequency "
     r"and buffer\.rows\[buffer\.queue\]\.any\(\):",
     r"if np\.count_nonzero\(buffer\.rows\[buffer\.queue\]\) >= args\.batch_size:",
     r"batch = buffer\.take\(args\.device\)",
     r'utilities = over_rows\(batch, agents, target\["agents"\]\)',
-    r"beta = np\.interp\(step / args\.exploration_timesteps, \[1, 2\], \[args\.hysteresis, 1\.0\]\)",
+    r"beta = np\.interp\(\(step - args\.learning_starts\) / args\.exploration_timesteps, \[1, 2\], "
+    r"\[args\.hysteresis, 1\.0\]\)",
     r"joint = joint_batch\(batch, max\(env\.n_actions\)\)",
     r'values, target_values = \(x\[\.\.\., 0\] for x in over_rows\(joint, learner\["critics"\], target\)\)  # .*',
     r"policy = soft_policy\(over_rows\(batch, agents\)\[0\], epsilon\)  # .*",

@@ -666,14 +666,14 @@ def test_same_seed_same_curve_and_seed_zero_counts(tmp_path):
 
 def test_epsilon_falls(tmp_path, monkeypatch):
     acted = Spy(monkeypatch, avf_qplex, "act")
-    options = {**TINY, "total_timesteps": 8_000, "learning_starts": 10_000, "exploration_timesteps": 6_000}
+    options = {**TINY, "total_timesteps": 8_000, "learning_starts": 2_000, "exploration_timesteps": 4_000}
     options |= dict(num_envs=20, eval_frequency=8_000)
     folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **options))
     logged = scalars(folder)["charts/epsilon"]
     assert [step for step, _ in logged] == [2_000, 4_000, 6_000, 8_000]
-    assert [round(value, 2) for _, value in logged] == [0.69, 0.37, 0.05, 0.05]
+    assert [round(value, 2) for _, value in logged] == [1.0, 0.53, 0.05, 0.05]
     epsilon = [call.epsilon for call in acted.calls if call.rng is not None]
-    assert epsilon[0] == 1.0 and epsilon[150] == pytest.approx(0.525) and epsilon[-1] == 0.05
+    assert set(epsilon[:101]) == {1.0} and epsilon[200] == pytest.approx(0.525) and epsilon[-1] == 0.05
     assert all(call.epsilon == 0 for call in acted.calls if call.rng is None), "evaluation is greedy"
 
 
@@ -681,6 +681,7 @@ def test_epsilon_falls(tmp_path, monkeypatch):
 def test_first_update_moves_the_target_by_polyak(tmp_path, monkeypatch, script):
     recorder, losses = Recorder(monkeypatch, script), Spy(monkeypatch, script, "td_loss")
     options = {**TINY, "total_timesteps": 400, "train_frequency": 200, "polyak": 0.9, "learning_rate": 0.01}
+    options["learning_rate_end"] = 1.0
     script.train(args_for(script, "bp-10", runs_dir=str(tmp_path), **options))
     assert len(losses.calls) == 1
     ((learner, target),) = recorder.copies
@@ -721,17 +722,17 @@ def test_training_passes_on_what_it_should(tmp_path, monkeypatch):
     assert len(learned) == 50 and len(learned[0].utilities) == 8 and learned[0].utilities.shape[1] == 7
     steps = np.array([236 + 40 * k for k in range(25)])
     betas = [call.hysteresis for call in learned[:25]]
-    assert betas == pytest.approx(np.interp(steps / 400, [1, 2], [0.2, 1.0]))
+    assert betas == pytest.approx(np.interp((steps + 4 - 200) / 400, [1, 2], [0.2, 1.0]))
     assert betas[0] == 0.2 and 0.2 < betas[10] < 1 and betas[-1] == 1.0
     assert rates[:25] == pytest.approx(1e-3 * (1 - steps / 1_200))
     assert len(optimizers) == 2 and max(norms) == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_step_size_is_constant_without_an_end(tmp_path, monkeypatch):
-    rates = []
-    step = torch.optim.Adam.step
+    rates, step = [], torch.optim.Adam.step
     monkeypatch.setattr(torch.optim.Adam, "step", lambda self: rates.append(self.param_groups[0]["lr"]) or step(self))
-    train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 600}))
+    options = {**TINY, "total_timesteps": 600, "learning_rate": 3e-4, "learning_rate_end": 1.0}
+    train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **options))
     assert rates == [3e-4] * 10
 
 

@@ -52,8 +52,9 @@ def play(monkeypatch, tmp_path):
             uniform = dict(total_timesteps=512 + 8 * updates, learning_starts=512, train_frequency=8, end_e=1.0,
                            batch_size=32, window=3, buffer_size=500, polyak=0.95)  # fmt: skip
             options = uniform | options
-        shared = dict(env="matrix", seed=SEED, runs_dir=str(tmp_path), gamma=1.0, hidden_size=32, eval_episodes=1)
-        args = dataclasses.replace(script.parse_args(["--env=wtd-s"]), **shared, **options)
+        shared = dict(env="matrix", seed=SEED, runs_dir=str(tmp_path), gamma=1.0, hidden_size=32, eval_episodes=1,
+                      reward_scale=1.0, learning_rate_end=1.0)  # fmt: skip
+        args = dataclasses.replace(script.parse_args(["--env=wtd-s"]), **shared | options)
         values = record_values(script, monkeypatch) if script in VALUES else None
         return scalars(script.train(args))["eval/return"][-1][1], values
 
@@ -171,7 +172,6 @@ def test_independent_learners_average_over_the_other(play):
 def test_actors_and_critics_find_the_optimum(play, game):
     """On policy: agent 1's a is best as long as agent 0 sometimes takes a, and then so is a for agent 0."""
     settings = dict(total_timesteps=15_000, batch_size=16, exploration_timesteps=10_000, learning_rate=2e-3)
-    settings["learning_rate_end"] = 1.0
     assert play(mac_iaicc, game, reward_scale=0.1, **settings)[0] == 8
 
 
@@ -196,7 +196,7 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
 
     monkeypatch.setattr(script, "td_loss", recording)
     shared = dict(env="waiting", seed=SEED, runs_dir=str(tmp_path), gamma=gamma, hidden_size=16, eval_episodes=1,
-                  total_timesteps=8_000, learning_starts=1_600, train_frequency=16, end_e=1.0, batch_size=64, window=4,
+                  reward_scale=1.0, total_timesteps=8_000, learning_starts=1_600, train_frequency=16, end_e=1.0, batch_size=64, window=4,
                   polyak=0.95, learning_rate=5e-3, learning_rate_end=0.0, exploration_timesteps=10**6)  # fmt: skip
     for beta in (0.3, 1.0):
         found[beta] = []

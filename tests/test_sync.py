@@ -77,7 +77,7 @@ CHANGES = {  # what a slip in one script looks like, and what the report then sa
     "learning of one": ("avf_qplex", "[1, 2], [args.hysteresis", "[0, 2], [args.hysteresis", "train"),
     "the loop of the actor-critic": ("mac_iaicc", "hidden[:, over] = 0.0\n\n", "hidden[:, over] = 0.1\n\n", "train"),
     "the program": ("mac_iaicc", "sys.exit(128 + stop[0])", "sys.exit(1)", "the rest"),
-    "a comment between": ("avf_vdn", "# Where the environment families", "# Where families", "the rest"),
+    "a comment between": ("avf_vdn", "# Where tasks whose ids start so", "# Where families", "the rest"),
     "a statement between": ("avf_qplex", "ALGORITHM = Path", "LIMIT = 1\nALGORITHM = Path", "the rest"),
 }
 
