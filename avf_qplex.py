@@ -368,8 +368,8 @@ def train(args, stop=()):
     while step < args.total_timesteps:
         # Choose and step
         epsilon = np.interp(step - args.learning_starts, [0, args.exploration_timesteps], [1.0, args.end_e])
-        lr_share = np.interp(step, [0, args.total_timesteps], [1.0, args.learning_rate_end])
-        optimizer.param_groups[0]["lr"] = lr_share * args.learning_rate
+        done = step / args.total_timesteps
+        optimizer.param_groups[0]["lr"] = args.learning_rate * (1 + done * (args.learning_rate_end - 1))
         actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
         state = infos["state"]
         buffer.add(obs, actions, infos["macro_done"], state)

@@ -196,8 +196,8 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
 
     monkeypatch.setattr(script, "td_loss", recording)
     shared = dict(env="waiting", seed=SEED, runs_dir=str(tmp_path), gamma=gamma, hidden_size=16, eval_episodes=1,
-                  reward_scale=1.0, total_timesteps=8_000, learning_starts=1_600, train_frequency=16, end_e=1.0, batch_size=64, window=4,
-                  polyak=0.95, learning_rate=5e-3, learning_rate_end=0.0, exploration_timesteps=10**6)  # fmt: skip
+                  reward_scale=1.0, total_timesteps=8_000, learning_starts=1_600, train_frequency=16, end_e=1.0,
+                  batch_size=64, window=4, polyak=0.95, learning_rate=5e-3, exploration_timesteps=10**6)  # fmt: skip
     for beta in (0.3, 1.0):
         found[beta] = []
         script.train(dataclasses.replace(script.parse_args(["--env=wtd-s"]), hysteresis=beta, **shared))
