@@ -40,7 +40,7 @@ ALGORITHM = Path(__file__).stem
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS
     seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
-    total_timesteps: int = 300_000  # environment steps of the run, over all environments
+    total_timesteps: int = 400_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
@@ -56,8 +56,8 @@ class Args:
     gamma: float = 0.99  # discount factor, in [0, 1]
     discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
     buffer_size: int = 2_500  # episodes in the replay buffer
-    batch_size: int = 32  # windows in an update
-    window: int = 50  # consecutive rows in a window
+    batch_size: int = 16  # episodes in an update
+    window: int = 100  # rows of an episode at most; where it begins later on, recurrent states are zeros too
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
     learning_starts: int = 5_000  # environment steps at random before the first update
     exploration_timesteps: int = 150_000  # steps after these over which the exploration rate falls from 1, linearly
@@ -83,11 +83,9 @@ class Args:
 
 # Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(total_timesteps=500_000, learning_rate=5e-4, gamma=0.95, discount="decision", learning_starts=200_000,
-               exploration_timesteps=100_000, td_lambda=0.5, hysteresis=0.1),
-    "wtd-t": dict(total_timesteps=800_000, exploration_timesteps=200_000),
-    "ct": dict(total_timesteps=600_000, num_envs=128, gamma=0.9, buffer_size=5_000, train_frequency=256, obs_scale=4.0,
-               reward_scale=10.0, td_lambda=0.8, hidden_size=32, eval_frequency=40_000, eval_episodes=400),
+    "bp": dict(gamma=0.95, discount="decision", learning_starts=150_000, td_lambda=0.5, hysteresis=0.1),
+    "wtd-t": dict(total_timesteps=800_000),
+    "ct": dict(gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip
 
 
@@ -203,13 +201,13 @@ class ReplayBuffer:
         self.rows[self.writing[over]] = 0
 
     def sample(self, batch_size, window, rng, device="cpu"):
-        """Windows of random episodes: tensors [B, T, ...] by name. T = window + 1, `valid` marks rows with a next one.
-        Every row is as likely as any other: windows reach over both ends of an episode and are cut there."""
+        """Random episodes, of longer ones a window: tensors [B, T, ...] by name, `valid` marks rows with a next one.
+        Windows reach over both ends and are cut there: every row of an episode is as likely as any other."""
         episode = rng.choice(self.queue[self.rows[self.queue] > 0], (batch_size, 1))
         last = self.rows[episode] - 1  # [B, 1], the row of the final observation
-        start = rng.integers(1 - window, last)
+        start = (last > window) * rng.integers(1 - window, last)  # 0 where the whole episode fits
         end = np.minimum(start + window, last)
-        row = np.maximum(start, 0) + np.arange(window + 1)  # [B, T]
+        row = np.maximum(start, 0) + np.arange(min(window, last.max()) + 1)  # [B, T]
         at = episode, np.minimum(row, end)
         since = self.since[at]  # [B, T, n]
         before = episode[..., None], since - 1, np.arange(since.shape[2])

@@ -32,7 +32,7 @@ GROUPS = {
     "DEFAULTS.bp": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.ct": [Q_LEARNING, "mac_iaicc"],
     **{f"Args.{field}": [Q_LEARNING, "mac_iaicc"] for field in (  # other values, or other words
-        "total_timesteps", "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
+        "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
 }  # fmt: skip
 
 # Lines of `train` that may differ between any two scripts: what is stored and the loss.
