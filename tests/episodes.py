@@ -95,15 +95,17 @@ played = cache(play)  # for tests that change nothing of it
 
 def random_windows(buffer, ended, count, window):
     """A batch of windows from anywhere, and what they are. Some are cut at the beginning of their episode, some at its
-    end, some by their own length."""
-    rng = np.random.default_rng(0)
-    number = rng.integers(len(ended), size=count)
-    number[:2] = [[episode.terminated for episode in ended].index(kind) for kind in (True, False)]
-    last = np.array([len(ended[e].rows) - 1 for e in number])
+    end, some by their own length; the last are episodes that fit, if there are any, and are whole."""
+    rng, length = np.random.default_rng(0), np.array([len(episode.rows) - 1 for episode in ended])
+    longer, whole = np.flatnonzero(length > window), np.flatnonzero(length <= window)[:3]
+    number = np.append(rng.choice(longer, count - len(whole)), whole)
+    number[:2] = [next(e for e in longer if ended[e].terminated == kind) for kind in (True, False)]
+    last = length[number]
     first = rng.integers(1 - window, last)
     first[:6] = [*(last[:3] - [1, 2, 3]), *(1 - window + np.arange(3))]
-    spans = [Span(ended[e], max(k, 0), min(k + window, n)) for e, k, n in zip(number, first, last, strict=True)]
-    cut = {(k < 0, k + window > n) for k, n in zip(first, last, strict=True)}
+    begin = np.where(last > window, first, 0)
+    spans = [Span(ended[e], max(k, 0), min(k + window, n)) for e, k, n in zip(number, begin, last, strict=True)]
+    cut = {(k < 0, k + window > n) for k, n in zip(begin, last, strict=True)}
     assert {(True, False), (False, True), (False, False)} <= cut
     batch = windows(buffer, number, first, window)
     assert batch["valid"].sum(1).tolist() == [span.end - span.begin for span in spans]

@@ -196,7 +196,11 @@ def test_short_episodes_are_drawn_as_often_as_long_ones():
         buffer.step(state, np.array([1, 2]), np.ones(2), np.array([t == 19, t == 3]), obs, infos)
     assert sorted(buffer.rows[buffer.queue].tolist()) == [0, 0, 5, 21]
     batch = buffer.sample(10_000, 6, "joint", np.random.default_rng(0))
-    assert abs((batch["reward"][:, 0] == 2).float().mean() - 0.5) < 0.03
+    short = batch["reward"][:, 0] == 2
+    assert abs(short.float().mean() - 0.5) < 0.03
+    assert (batch["valid"][short].sum(1) == 4).all(), "what fits is whole"
+    whole = buffer.sample(100, 60, "joint", np.random.default_rng(0))["valid"]
+    assert whole.shape == (100, 21) and set(whole.sum(1).tolist()) == {4, 20}
 
 
 @pytest.mark.parametrize("mixer_state", ["joint", "single", "real", "decision"])
@@ -438,7 +442,7 @@ def test_obs_scale_reaches_the_macro_observation_only():
     with torch.no_grad():
         torch.testing.assert_close(scaled(obs, previous, hidden, [6]), plain(5 * obs, previous, hidden, [6]))
         assert not torch.allclose(scaled(obs, previous, hidden, [6])[0], plain(obs, previous, hidden, [6])[0])
-    learner = avf_qplex.make_learner(args_for(avf_qplex, "ct-10"), envs.make("ct-10"))
+    learner = avf_qplex.make_learner(args_for(avf_qplex, "ct-10", hidden_size=32), envs.make("ct-10"))
     assert learner["agents"].obs_scale == 4.0 and learner["agents"].hidden_size == 32
 
 
