@@ -57,7 +57,7 @@ class Args:
     # Algorithm
     learning_rate: float = 1e-3  # Adam's step size
     learning_rate_end: float = 0.0  # share of the step size left at total_timesteps, reached linearly
-    gamma: float = 0.99  # discount factor, in [0, 1]
+    gamma: float = 0.95  # discount factor, in [0, 1]
     discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
     buffer_size: int = 2_500  # episodes in the replay buffer
     batch_size: int = 16  # episodes in an update
@@ -87,7 +87,7 @@ class Args:
 
 # Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(gamma=0.95, discount="decision", learning_starts=150_000, td_lambda=0.5, hysteresis=0.1),
+    "bp": dict(discount="decision", learning_starts=150_000, td_lambda=0.5, hysteresis=0.1),
     "wtd-t": dict(total_timesteps=800_000),
     "ct": dict(gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip

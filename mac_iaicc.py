@@ -61,7 +61,7 @@ class Args:
     # Algorithm
     learning_rate: float = 1e-3  # Adam's step size
     learning_rate_end: float = 0.0  # share of the step size left at total_timesteps, reached linearly
-    gamma: float = 0.99  # discount factor, in [0, 1]
+    gamma: float = 0.95  # discount factor, in [0, 1]
     discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
     batch_size: int = 8  # episodes that end before an update is made on them
     n_step: int = 5  # macro-actions of an agent in its return before its target critic takes over
@@ -88,7 +88,7 @@ class Args:
 
 # Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000, gamma=0.95),
+    "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000),
     "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, batch_size=32,
                obs_scale=4.0, reward_scale=1.0, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip

@@ -31,7 +31,7 @@ import envs
 from envs.box_pushing import NORTH, PUSH, STAY, WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT
 
 # As in the algorithm scripts, so that discounted returns can be put side by side
-GAMMA = {"bp": 0.95, "wtd": 0.99, "ct": 0.9}
+GAMMA = {"bp": 0.95, "wtd": 0.95, "ct": 0.9}
 
 # In the order in which the arm hands them out: a robot, and the humans to whom it goes. A human gets its tools in
 # the order in which it needs them. Three robots can always take one tool at a time, in turn.

@@ -70,7 +70,7 @@ CHANGES = {  # what a slip in one script looks like, and what the report then sa
     "a shared function": ("avf_qmix", "live &= ~over", "live = live & ~over", "evaluate"),
     "a comment in one": ("mac_iaicc", "# runs no code of the file", "# safe", "load"),
     "a group's member": ("avf_qmix", '"real": state', '"true": state', "ReplayBuffer"),
-    "a default": ("cen_maddrqn", "gamma: float = 0.99", "gamma: float = 0.98", "Args.gamma"),
+    "a default": ("cen_maddrqn", "gamma: float = 0.95", "gamma: float = 0.98", "Args.gamma"),
     "a setting's help": ("dec_maddrqn", "# episodes in the replay buffer", "# episodes", "Args.buffer_size"),
     "a family's values": ("avf_vdn", "td_lambda=0.8", "td_lambda=0.9", "DEFAULTS.ct"),
     "the loop of one": ("dec_maddrqn", "recent = []\n        if", "recent.clear()\n        if", "train"),
