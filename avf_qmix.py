@@ -10,8 +10,9 @@ value, trained on the joint reward (paper: "Value Factorization for Asynchronous
     mixer (Eq. 1)     Q(h, s, m) = f_s(Q_1(h_1, m_1), ..., Q_n(h_n, m_n)), not falling in any utility, see QMIXMixer
 
 Numbered deviations from the paper:
- 1. Discounts are gamma^tau between rows. A truncated episode bootstraps from its final observation.
- 2. Values are ours (docs/defaults.md), as are Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
+ 1. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
+ 2. Values are ours (docs/defaults.md), as are whole episodes instead of windows of 25, random play before learning,
+    Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
 """
 
 import argparse

@@ -14,8 +14,9 @@ Numbered deviations from the paper:
     (--no-mask-ongoing) breaks Mac-IGM: an ongoing agent's negative advantage is weighted by what the others choose.
  2. A_i = Q_i - max Q_i (Eq. 4), not a dueling head (Def. 3.3): advantages of any sign break Mac-IGM (theory/README.md).
  3. The mixer's hypernetworks share one hidden layer of the same total width instead of having one each.
- 4. Discounts are gamma^tau between rows. A truncated episode bootstraps from its final observation.
- 5. Values are ours (docs/defaults.md), as are Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
+ 4. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
+ 5. Values are ours (docs/defaults.md), as are whole episodes instead of windows of 25, random play before learning,
+    Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
 """
 
 import argparse

@@ -10,8 +10,9 @@ value, trained on the joint reward (paper: "Value Factorization for Asynchronous
     mixer             Q(h, m) = sum_i Q_i(h_i, m_i), which needs no state
 
 Numbered deviations from the paper:
- 1. Discounts are gamma^tau between rows. A truncated episode bootstraps from its final observation.
- 2. Values are ours (docs/defaults.md), as are Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
+ 1. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
+ 2. Values are ours (docs/defaults.md), as are whole episodes instead of windows of 25, random play before learning,
+    Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
 """
 
 import argparse

@@ -13,9 +13,10 @@ With one agent that decides at every row, replay, loss and training loop are tho
 new is the network `Team`, whose joint macro-actions that would change an ongoing macro-action have the value -inf.
 
 Numbered deviations from the paper and its baseline:
- 1. Discounts are gamma^tau between rows. A truncated episode bootstraps from its final observation.
+ 1. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
  2. The network is told which agents are free and the macro-actions before; the published one sees macro-observations.
- 3. Values are ours (docs/defaults.md), as are Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
+ 3. Values are ours (docs/defaults.md), as are whole episodes instead of windows of 25, random play before learning,
+    Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
 """
 
 import argparse

@@ -17,7 +17,8 @@ Numbered deviations from the published baseline:
  1. An episode truncated by the horizon bootstraps from its final observation, a terminated one does not.
  2. A macro-action that is running at the first row of a window or still running at its last gives no transition there.
  3. One gradient norm is clipped over all agents. Their losses are summed, each a mean over the agent's transitions.
- 4. Values are ours (docs/defaults.md), as are returns over several macro-actions, scaled inputs and rewards.
+ 4. Values are ours (docs/defaults.md), as are returns over several macro-actions, scaled inputs and rewards; on Box
+    Pushing gamma counts once a row of the team (--discount), the published code once an agent's decision.
 """
 
 import argparse

@@ -82,11 +82,10 @@ def learned(script, args):
     learner.load_state_dict(script.load(folder / "last.pt")["networks"])
     push_beside_random_partner(args.env, args.num_envs, args.seed, buffer)
     mixer_state = [args.mixer_state] if hasattr(args, "mixer_state") else []
-    batch = buffer.sample(2_000, args.window, *mixer_state, np.random.default_rng(args.seed))
+    batch = buffer.sample(500, args.window, *mixer_state, np.random.default_rng(args.seed))
     with torch.no_grad():
         (utilities,) = script.over_rows(batch, learner["agents"])  # [B, T, n, A]
-        known = (batch["previous"][:, :1] < 0).all(2)  # [B, 1], windows from the first row on: nothing is forgotten
-        pushes = batch["chosen"][..., 0] & (batch["action"][..., 0] == PUSH) & batch["valid"] & known  # [B, T]
+        pushes = batch["chosen"][..., 0] & (batch["action"][..., 0] == PUSH) & batch["valid"]  # [B, T]
         other = utilities[..., 0, :].clone()  # [B, T, A]
         other[..., PUSH] = -torch.inf
         found = []
@@ -98,7 +97,7 @@ def learned(script, args):
             else:
                 inputs = (taken, utilities.amax(3), action, batch["chosen"], batch["state"])
                 q = learner["mixer"](*(x[pushes] for x in inputs))
-            found.append(q.mean().item())
+            found.append(q.mean().item() / args.reward_scale)
     return found
 
 
@@ -120,8 +119,8 @@ def main(argv=None):
         for script in scripts:
             for beta in BETAS:
                 args = replace(script.parse_args(["--env=bp-10"]), hysteresis=beta, total_timesteps=options.steps,
-                               seed=options.seed, end_e=1.0, exploration_timesteps=10**9, runs_dir=folder,
-                               eval_frequency=10**9)  # fmt: skip
+                               seed=options.seed, end_e=1.0, exploration_timesteps=10**9, learning_starts=5_000,
+                               runs_dir=folder, eval_frequency=10**9)  # fmt: skip
                 found[script, beta] = learned(script, args)
                 push, other = found[script, beta]
                 predicted = value(beta, p, BIG, FAILS, other, gamma)
