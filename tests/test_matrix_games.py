@@ -24,6 +24,7 @@ import envs
 import mac_iaicc
 from tests.curves import scalars
 from tests.matrix_game import MatrixGame, WaitingGame
+from theory import optimism
 
 ADDITIVE = np.add.outer([0.0, 3.0, 1.0], [2.0, 0.0, 5.0])  # best (b, c): 8
 MONOTONIC = np.array([(8.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])  # both are needed
@@ -177,12 +178,11 @@ def test_actors_and_critics_find_the_optimum(play, game):
 
 @pytest.mark.parametrize("script", [avf_vdn, avf_qmix, avf_qplex], ids=lambda s: s.__name__)
 def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch, tmp_path):
-    """Beside a random partner the value e of pushing is where the weights of errors balance (docs/defaults.md):
-    joins (big - e) = beta^2 (1 - joins) (e - (gamma max(e, safe) - fails)), above `safe` for beta below a bound."""
+    """What theory/optimism.py predicts, on a game in which nothing else matters. By hand: below beta = 0.527 it pays to
+    push; for beta 0.3, 0.1 (10 - e) = 0.081 (e - 0.9 e + 3) gives e = 7.0, and for 1, 0.1 (10 - e) = 0.9 (e - 0.9 * 2
+    + 3) gives -0.08."""
     game, gamma = dict(joins=0.1, big=10.0, fails=3.0, safe=2.0), 0.9
-    p, big, fails, safe = game.values()
-    bound = (p / (1 - p) * (big - safe) / (fails + (1 - gamma) * safe)) ** 0.5
-    assert bound == pytest.approx(0.527, abs=1e-3)
+    assert optimism.bound(*game.values(), gamma) == pytest.approx(0.527, abs=1e-3)
     monkeypatch.setitem(envs._TASKS, "waiting", (WaitingGame, game))
     monkeypatch.setattr(envs, "IDS", (*envs.IDS, "waiting"))
     td_loss, found = script.td_loss, {}
@@ -202,7 +202,5 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
         found[beta] = []
         script.train(dataclasses.replace(script.parse_args(["--env=wtd-s"]), hysteresis=beta, **shared))
         push, leave = np.mean(found[beta][-100:], 0)
-        weight = beta**2 * (1 - p)
-        again = (p * big - weight * fails) / (p + weight * (1 - gamma))  # where pushing goes on, else safe follows
-        expected = again if beta < bound else (p * big + weight * (gamma * safe - fails)) / (p + weight)
-        assert push == pytest.approx(expected, abs=1) and leave == pytest.approx(safe, abs=0.3)
+        assert optimism.value(beta, *game.values(), gamma) == pytest.approx({0.3: 7.0, 1.0: -0.08}[beta], abs=0.01)
+        assert push == pytest.approx({0.3: 7.0, 1.0: -0.08}[beta], abs=1) and leave == pytest.approx(2, abs=0.3)
