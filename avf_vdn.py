@@ -1,13 +1,12 @@
 """AVF-VDN: asynchronous value factorization with VDN's sum of utilities.
 
 Agents run macro-actions of different lengths and decide at different times. Each has a recurrent utility network Q_i
-over its own macro-history; a mixer combines the utilities of all of them, of ongoing macro-actions too, into one joint
-value, trained on the joint reward (paper: "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning").
+over its own macro-history; the joint value Q(h, m) = sum_i Q_i(h_i, m_i), ongoing macro-actions too, learns from the
+joint reward (paper: "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning").
 
     row k             a time step at which at least one agent starts a macro-action; only these are stored (Fig. 2)
     target (Eq. 14)   y = r + gamma^tau Q'(h', m*), m*_i = argmax Q_i(h'_i, .) for agents that choose at the next row
                       and the running macro-action for the others: the conditional argmax of Eqs. 5 and 7
-    mixer             Q(h, m) = sum_i Q_i(h_i, m_i), which needs no state
 
 Numbered deviations from the paper:
  1. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
@@ -86,7 +85,8 @@ class Args:
 DEFAULTS = {
     "bp": dict(discount="decision", learning_starts=150_000, td_lambda=0.5, hysteresis=0.1),
     "wtd-t": dict(total_timesteps=800_000),
-    "ct": dict(gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8, eval_frequency=40_000, eval_episodes=400),
+    "ct": dict(num_envs=128, train_frequency=256, gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8,
+               total_timesteps=600_000, eval_frequency=40_000, eval_episodes=400),
 }  # fmt: skip
 
 
