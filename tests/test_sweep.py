@@ -456,7 +456,7 @@ def cluster():
 
 def test_a_sweep_on_ray_is_stopped_and_survives_the_loss_of_a_node(place, cluster):
     """Of three runs on two nodes the first two are stopped; continued, one of the nodes is killed under its run."""
-    options = ["--pause=0.2", "--total-timesteps=40", "--checkpoint-frequency=2", "--writing=1"]
+    options = ["--pause=0.2", "--total-timesteps=20", "--checkpoint-frequency=2", "--writing=1"]
     own = ["--engine", "ray", "--address", cluster.address]
     arguments = command(place, *options, seeds="1-3", own=own)
     process = start(place / "benchmark" / "sweep.py", arguments)
