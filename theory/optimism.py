@@ -27,7 +27,6 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script, Python looks in this folder only
 
 import avf_qmix
-import avf_qplex
 import avf_vdn
 import envs
 from envs.box_pushing import PUSH, WAYPOINT_BIG_LEFT
@@ -107,14 +106,14 @@ def main(argv=None):
     parser.add_argument("--seed", type=int, default=101, help="default: %(default)s")
     parser.add_argument("-o", "--output", type=Path, help="the figure, PNG")
     options = parser.parse_args(argv)
-    gamma, safe = avf_qplex.parse_args(["--env=bp-10"]).gamma, 20.0
+    gamma, safe = avf_qmix.parse_args(["--env=bp-10"]).gamma, 20.0
     for env_id in ("bp-10", "bp-20", "bp-30"):
         p, share = push_beside_random_partner(env_id)
         print(f"{env_id}: p {p:.4f} a push, {share:.3f} an episode; bound {bound(p, BIG, FAILS, safe, gamma):.3f}")
     if not options.steps:
         return
     p, _ = push_beside_random_partner("bp-10")
-    scripts, found = (avf_vdn, avf_qmix, avf_qplex), {}
+    scripts, found = (avf_vdn, avf_qmix), {}
     with tempfile.TemporaryDirectory() as folder:
         for script in scripts:
             for beta in BETAS:

@@ -33,7 +33,7 @@ def test_the_value_is_a_balance_and_crosses_at_the_bound():
         assert p * (optimism.BIG - e) == pytest.approx(beta**2 * (1 - p) * (e - short))
 
 
-@pytest.mark.parametrize("script", [optimism.avf_vdn, optimism.avf_qplex], ids=lambda s: s.__name__)
+@pytest.mark.parametrize("script", [optimism.avf_vdn, optimism.avf_qmix], ids=lambda s: s.__name__)
 def test_what_a_team_has_learned_is_read(tmp_path, script):
     """Values of two choices that are not the same, in units of rewards, not of scaled ones."""
     found = [
