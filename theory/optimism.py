@@ -129,20 +129,20 @@ def main(argv=None):
 
 
 def draw(found, p, gamma, safe, path):
-    """The joint value of pushing and of the best other macro-action against beta, beside the prediction."""
+    """The joint value of pushing and of the best other macro-action against beta, beside what the latter predicts."""
     import matplotlib  # optional: pip install -e '.[report]'
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    fine = np.geomspace(min(BETAS), max(BETAS), 200)
-    axes.plot(fine, [value(beta, p, BIG, FAILS, safe, gamma) for beta in fine], "k-", label="push, predicted")
     axes.axvline(bound(p, BIG, FAILS, safe, gamma), color="0.7", label="bound")
     for k, script in enumerate(dict.fromkeys(script for script, _ in found)):
         push, other = np.array([found[script, beta] for beta in BETAS]).T
-        axes.plot(BETAS, push, "o-", color=f"C{k}", label=f"push, {script.ALGORITHM}")
-        axes.plot(BETAS, other, "x:", color=f"C{k}", label=f"best other, {script.ALGORITHM}")
+        predicted = [value(beta, p, BIG, FAILS, o, gamma) for beta, o in zip(BETAS, other, strict=True)]
+        axes.plot(BETAS, push, "o-", color=f"C{k}", label=f"{script.ALGORITHM}: push, measured")
+        axes.plot(BETAS, predicted, "o--", color=f"C{k}", mfc="none", label="push, predicted")
+        axes.plot(BETAS, other, "x:", color=f"C{k}", label="best other, measured")
     axes.set(xscale="log", xlabel="beta: factor on negative TD errors (--hysteresis)", ylabel="joint value")
     axes.set_xticks(BETAS, [str(beta) for beta in BETAS], minor=False)
     axes.minorticks_off()
