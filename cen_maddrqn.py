@@ -43,7 +43,7 @@ ALGORITHM = Path(__file__).stem
 
 @dataclass
 class Args:
-    env: str = "wtd-s"  # task, one of envs.IDS
+    env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see envs.register
     seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
     total_timesteps: int = 400_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
@@ -76,8 +76,8 @@ class Args:
     hidden_size: int = 64  # width of the agents' layers
 
     def __post_init__(self):
-        if self.env not in envs.IDS:
-            raise SystemExit(f"unknown --env {self.env!r}; valid ids: {' '.join(envs.IDS)}")
+        if problem := envs.problem(self.env):
+            raise SystemExit(f"--env: {problem}")
         shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis"
         for name, value in vars(self).items():
             low = type(value) is int and name not in ("seed", "learning_starts")
@@ -198,7 +198,7 @@ class ReplayBuffer:
             "action": (n,),  # the macro-action that it runs
             "since": (n,),  # and since which row: its macro-history moves where that is this one
             "reward": (),  # sum of gamma^t r_t until the next row
-            "discount": (),  # gamma^tau, 0 where the episode terminated
+            "discount": (),  # gamma^tau (1 with --discount decision), 0 where the episode terminated
         }
         for name, shape in fields.items():
             kind = int if name in ("action", "since") else np.float32

@@ -746,7 +746,6 @@ def test_finds_the_optimum_of_a_non_monotonic_game(tmp_path, monkeypatch):
     With hysteretic errors, as on Box Pushing: with the plain loss QPLEX stays at 0 for thousands of updates.
     """
     monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, {}))
-    monkeypatch.setattr(envs, "IDS", (*envs.IDS, "matrix"))
     args = Args(env="matrix", runs_dir=str(tmp_path), total_timesteps=6_000, learning_starts=500, train_frequency=24,
                 exploration_timesteps=100_000, end_e=1.0, learning_rate=1e-3, batch_size=32, window=4, polyak=0.95,
                 td_lambda=1.0, hysteresis=0.5, eval_frequency=1_000, eval_episodes=1)  # fmt: skip

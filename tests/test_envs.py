@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import envs
+from tests.matrix_game import MatrixGame
 
 every_task = pytest.mark.parametrize("env_id", envs.IDS)
 
@@ -184,6 +185,23 @@ def test_reset_mask_touches_only_its_environments():
     for name in ("position", "target", "elapsed", "episode_return", "_obs"):
         np.testing.assert_array_equal(before[name][[0, 2]], after[name][[0, 2]])
     assert after["elapsed"].tolist() == [5, 0, 5]
+
+
+def test_a_registered_task_is_known_everywhere(monkeypatch):
+    monkeypatch.setattr(envs, "_TASKS", dict(envs._TASKS))
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    envs.register("matrix", MatrixGame, tell=True)
+    assert envs.problem("matrix") is None and "matrix" not in envs.IDS
+    assert envs.make("matrix", num_envs=3).tell and not envs.make("matrix", tell=False).tell
+    assert gym.make("matrix-v0").reset(seed=0)[0].shape == (2, 9)
+    assert envs.make("tests.matrix_game:matrix", 2).num_envs == 2
+    with pytest.raises(ValueError, match="there is an environment 'matrix' already"):
+        envs.register("matrix", MatrixGame)
+    with pytest.raises(gym.error.Error, match="Malformed"):
+        envs.register("a b", MatrixGame)
+    assert envs.problem("a b") == f"unknown environment 'a b'; valid ids: {' '.join(envs.IDS)} matrix"
+    with pytest.raises(ImportError, match="No module named 'nowhere'"):
+        envs.make("nowhere:matrix")
 
 
 def test_bad_input_says_what_is_wrong():

@@ -47,7 +47,6 @@ def play(monkeypatch, tmp_path):
     def play(script, game, **options):
         payoff, updates, setting = SETTINGS[game]
         monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, dict(payoff=payoff, tell=True)))
-        monkeypatch.setattr(envs, "IDS", (*envs.IDS, "matrix"))
         options = setting | options
         if script is not mac_iaicc:
             uniform = dict(total_timesteps=512 + 8 * updates, learning_starts=512, train_frequency=8, end_e=1.0,
@@ -184,7 +183,6 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
     game, gamma = dict(joins=0.1, big=10.0, fails=3.0, safe=2.0), 0.9
     assert optimism.bound(*game.values(), gamma) == pytest.approx(0.527, abs=1e-3)
     monkeypatch.setitem(envs._TASKS, "waiting", (WaitingGame, game))
-    monkeypatch.setattr(envs, "IDS", (*envs.IDS, "waiting"))
     td_loss, found = script.td_loss, {}
 
     def recording(*args):

@@ -285,10 +285,29 @@ def test_runs_never_share_a_folder(tmp_path, monkeypatch):
     assert len({train(args) for _ in range(3)} | {folder}) == 4
 
 
+def test_a_task_in_a_module_of_its_own(tmp_path):
+    """Found through --env module:id, trained and played, each in a process of its own."""
+    module = (
+        "import envs\nfrom tests.matrix_game import MatrixGame\n\nenvs.register('my-task', MatrixGame, tell=True)\n"
+    )
+    (tmp_path / "my_module.py").write_text(module)
+    path = os.pathsep.join([str(ROOT), str(tmp_path)])
+    tiny = dict(total_timesteps=400, learning_starts=100, num_envs=4, eval_episodes=2, hidden_size=8, runs_dir=tmp_path)
+    command = [sys.executable, ROOT / "avf_qmix.py", "--env=my_module:my-task", *flags(tiny)]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=True)
+    folder = done.stdout.strip()
+    assert Path(folder).name.startswith("my_module:my-task__avf_qmix__1__")
+    command = [sys.executable, ROOT / "play.py", folder, "--episodes=2"]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("my_module:my-task avf_qmix best model of step 400: 2 greedy episodes")
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--env=wtd-x"], "unknown --env 'wtd-x'; valid ids: bp-10 bp-20"),
+        (["--env=wtd-x"], "--env: unknown environment 'wtd-x' (did you mean 'wtd-t'?); valid ids: bp-10 bp-20"),
+        (["--env=no_such_module:my-task"], "--env: No module named 'no_such_module'"),
+        (["--env=envs:my-task"], "--env: unknown environment 'envs:my-task'"),
         (["--gamma=1.5"], "--gamma must be from 0 to 1, got 1.5"),
         (["--end-e=-0.1"], "--end-e must be from 0 to 1, got -0.1"),
         (["--polyak=1.01"], "--polyak must be from 0 to 1, got 1.01"),
