@@ -1,8 +1,8 @@
 """What is kept of runs: a row for each in runs.csv and its evaluations in evaluations.csv, both plain text.
 
 KEY says which run it is. flags: those that differ from the script's defaults for the task, as "name=value name=value".
-checksum: of the script and of envs/*.py, because changed code makes another run. A script cannot tell its own checksum,
-so the sweep leaves ORIGIN beside its run folders; of a run that was started by hand it is not known, and empty.
+checksum: of the script and of envs/*.py, because changed code makes another run (`checksum`). A script cannot tell its
+own, so the sweep leaves ORIGIN beside its run folders; of a run that was started by hand it is not known, and empty.
 """
 
 import fcntl
@@ -51,10 +51,15 @@ def flags_of(algorithm, arguments):
     return " ".join(f"{name}={value}" for name, value in arguments.items() if usual.get(name, ...) != value)
 
 
-def checksum(algorithm):
-    """Of all the code of this repository that a run of the script executes."""
-    code = [ROOT / f"{algorithm}.py", *sorted((ROOT / "envs").glob("*.py"))]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest()[:12]
+def checksum(algorithm, env):
+    """Of all that a run executes: the script, for its DEFAULTS the values in force on the task, and envs/*.py.
+
+    So a value that is changed for one family of tasks leaves the recorded runs of the others what they are.
+    """
+    values = asdict(load_script(algorithm).parse_args([f"--env={env}"]))
+    script = re.sub(r"^DEFAULTS = \{.*?^\}", repr(values), (ROOT / f"{algorithm}.py").read_text(), flags=re.S | re.M)
+    code = [script.encode(), *(path.read_bytes() for path in sorted((ROOT / "envs").glob("*.py")))]
+    return hashlib.sha256(b"".join(code)).hexdigest()[:12]
 
 
 def commit():

@@ -115,7 +115,7 @@ def run_job(job):
                 result = "finished" if attempts else "skipped"
             elif stop or code in (128 + signal.SIGINT, 128 + signal.SIGTERM):
                 result = "stopped"
-            elif record.checksum(job["algorithm"]) != job["checksum"]:
+            elif record.checksum(job["algorithm"], job["env"]) != job["checksum"]:
                 result, error = "failed", "the code was changed since the sweep began"
             elif attempts == ATTEMPTS:
                 result = "failed"
@@ -231,7 +231,7 @@ def make_jobs(args, options):
         if not usual.items() <= arguments.items():
             fail("--env, --seed and --runs-dir cannot stand behind --, the sweep sets them")
         flags, variant = record.flags_of(algorithm, arguments), args.variant
-        cell = {"algorithm": algorithm, "env": env, "flags": flags, "checksum": record.checksum(algorithm)}
+        cell = {"algorithm": algorithm, "env": env, "flags": flags, "checksum": record.checksum(algorithm, env)}
         cells.append(NOT_RUN | cell | {"variant": flags if variant is None else variant, "options": options})
     # All of the first seed before the second, so that a sweep of days soon shows something of everything
     numbers = dict.fromkeys(itertools.chain.from_iterable(args.seeds))

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import pandas as pd
@@ -249,6 +250,31 @@ def test_a_run_is_known_by_its_flags_and_code(place, capsys):
     assert record.describe(own.parent)["checksum"] == "" != record.describe(run_folders(place)[-1])["checksum"]
 
 
+def test_a_value_of_another_family_leaves_the_checksum(tmp_path, monkeypatch):
+    """By DEFAULTS as the scripts have it: a row of it counts on its own tasks, anything else on all."""
+    monkeypatch.setattr(record, "ROOT", tmp_path)
+    (tmp_path / "envs").mkdir()
+    text = (ROOT / "avf_vdn.py").read_text()
+    for edit, changes in (
+        (("td_lambda=0.8", "td_lambda=0.7"), {"ct-10"}),
+        (("td_lambda=0.5", "td_lambda=0.6"), {"bp-10"}),
+        (("# Choose and step", "# Choose, step"), {"bp-10", "wtd-s", "ct-10"}),
+        (("gamma: float = 0.95", "gamma: float = 0.94"), {"bp-10", "wtd-s", "ct-10"}),
+    ):
+        found = []
+        for text_now in (text, text.replace(*edit)):
+            assert (text_now == text) == (len(found) == 0)
+            (tmp_path / "avf_vdn.py").write_text(text_now)
+            script = types.ModuleType("avf_vdn")
+            monkeypatch.setitem(sys.modules, "avf_vdn", script)
+            script.__file__ = "avf_vdn.py"
+            exec(text_now, vars(script))
+            monkeypatch.setattr(record, "load_script", lambda name, script=script: script)
+            found.append({env: record.checksum("avf_vdn", env) for env in ("bp-10", "wtd-s", "ct-10")})
+        before, after = found
+        assert {env for env in before if before[env] != after[env]} == changes, edit
+
+
 def test_code_that_changes_during_a_sweep_is_not_run(place, capsys, monkeypatch):
     real = sweep.run_script
 
@@ -358,7 +384,7 @@ def test_recorded_runs_are_kept_and_skipped_without_their_folders(place, capsys)
     assert sweep.main(command(place, seeds="1-3", own=keep)) == 0, "those that were finished before are recorded, too"
     runs, evaluations = recorded(place)
     assert sorted(runs["seed"]) == [1, 2, 3] and list(runs) == record.RUNS
-    assert set(runs["checksum"]) == {record.checksum("counter")} and set(runs["steps"]) == {4}
+    assert set(runs["checksum"]) == {record.checksum("counter", "bp-10")} and set(runs["steps"]) == {4}
     assert set(runs["flags"]) == set(runs["variant"]) == {""}
     one = evaluations[evaluations["seed"] == 2]
     assert list(one["step"]) == [1, 2, 3, 4] and list(one["return"]) == list(one["success"]) == [10, 20, 30, 40]
