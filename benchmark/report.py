@@ -111,24 +111,19 @@ def panels_of(section, runs):
 def plot(path, widths, panels, evaluations):
     """A PNG of panels, so many in each row, with one legend; those without runs stay empty."""
     plt.rcParams.update(PAPER["matplotlib"])
-    size = max(9, 3.5 * max(widths)), 1 + 3.2 * len(widths)
-    figure, axes = plt.subplots(len(widths), max(widths), figsize=size, squeeze=False)
-    labels, others = (
-        {label for runs in panels.values() for label in runs["label"]},
-        itertools.cycle(PAPER["other styles"]),
-    )
+    figure = plt.figure(figsize=(max(9, 3.5 * max(widths)), 1 + 3.2 * len(widths)))
+    titles, others = iter(panels), itertools.cycle(PAPER["other styles"])
+    mosaic = [[*itertools.islice(titles, width), *["."] * (max(widths) - width)] for width in widths]
+    labels = {label for runs in panels.values() for label in runs["label"]}
     styles = PAPER["styles"] | {label: next(others) for label in sorted(labels - PAPER["styles"].keys())}
-    for ax in axes.flat:
-        ax.axis("off")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("return of greedy episodes")
-    places = [ax for row, width in zip(axes, widths, strict=True) for ax in row[:width]]
     legend = {}
-    for ax, (title, runs) in zip(places, panels.items(), strict=True):
-        ax.set_title(title if len(runs) else f"{title}: no runs yet")
-        if len(runs):
-            draw(ax, runs, evaluations, styles)
-            legend |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    for title, ax in figure.subplot_mosaic(mosaic).items():
+        ax.set_title(title if len(panels[title]) else f"{title}: no runs yet")
+        if not len(panels[title]):
+            ax.axis("off")
+            continue
+        draw(ax, panels[title], evaluations, styles)
+        legend |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     columns = max(1, int(11 * figure.get_figwidth()) // (max(map(len, legend)) + 9))  # as many as fit side by side
     figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns)
     figure.savefig(path)
@@ -140,9 +135,8 @@ def draw(ax, runs, evaluations, styles):
     groups = runs.groupby("label", sort=False)
     for i, (label, of) in enumerate(groups):
         curves = evaluations[evaluations["run"].isin(of.index)].pivot(index="run", columns="step", values="return")
-        curves = curves.dropna(axis=1)
-        middle, error = curves.mean(), curves.sem()
-        x, every = curves.columns / 1000, max(1, curves.shape[1] // 8)
+        middle, error = curves.dropna(axis=1).mean(), curves.dropna(axis=1).sem()
+        x, every = middle.index / 1000, max(1, len(middle) // 8)
         colour, marker = styles[label]
         marks = dict(marker=marker, ms=4.5, markevery=(i * every // len(groups), every))
         ax.fill_between(x, middle - error, middle + error, color=colour, alpha=0.15, lw=0, zorder=2)
@@ -155,8 +149,8 @@ def draw(ax, runs, evaluations, styles):
     top = max(np.max(line.get_ydata()) for line in ax.lines)
     ax.set_ylim(bottom, top + 0.05 * (top - bottom))
     usual = runs[runs["variant"] == ""]  # a variant may go on for longer
-    ax.set(xlim=(0, (usual if len(usual) else runs)["step"].max() / 1000), xlabel="environment steps (thousands)")
-    ax.axis("on")
+    ax.set_xlim(0, (usual if len(usual) else runs)["step"].max() / 1000)
+    ax.set(xlabel="environment steps (thousands)", ylabel="return of greedy episodes")
 
 
 def table(rows):

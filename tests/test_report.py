@@ -329,7 +329,7 @@ def test_figure_4_has_the_papers_layout(tmp_path, monkeypatch):
     make(tmp_path, tmp_path / "runs")
     one, two = ([ax.get_title() for ax in figure.axes] for figure in made)
     assert one == ["bp-10: no runs yet", "bp-20", "bp-30: no runs yet"]
-    assert two == [*one, "", "wtd-s", *(f"wtd-{name}: no runs yet" for name in ("d", "t", "t1"))]
+    assert two == [*one, "wtd-s", *(f"wtd-{name}: no runs yet" for name in ("d", "t", "t1"))]
 
 
 def test_curves_of_figures_by_hand(tmp_path):
