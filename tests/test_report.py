@@ -171,6 +171,8 @@ def test_every_run_is_in_a_section_once_it_is_in_none_of_the_papers(tmp_path):
     write_run(tmp_path / "runs", "cen_maddrqn", "wtd-s", 1, rising(10))
     text = make(tmp_path, tmp_path / "runs")
     assert [row["task"] for row in rows(section(text, "Figure 4"), "wtd-s")] == ["wtd-s"]
+    titles = [line[3:] for line in text.splitlines() if line[:3] == "## "]
+    assert titles == ["Figure 4", "Other runs", "Sources"], "the others would show nothing new"
     own = section(text, "Other runs")
     assert [row[""] for row in rows(own, "wtd-s")] == ["AVF-QPLEX", "Cen-MADDRQN"]
     assert rows(own, "ct-10", "AVF-QMIX gamma=0.5") and rows(own, "AVF-QPLEX > Cen-MADDRQN")[0]["wtd-s"] == "1.00"
