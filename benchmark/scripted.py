@@ -43,11 +43,6 @@ LOADS = {
 }
 
 
-def fail(message):
-    """Ends the program with one line."""
-    raise SystemExit(f"scripted: {message}")
-
-
 def random_policy(env, rng):
     return rng.integers(env.n_actions, size=(env.num_envs, env.n_agents))
 
@@ -149,13 +144,13 @@ def reference(env_id, policy, episodes, seed=0):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.error = fail
+    parser.error = lambda message: sys.exit(f"scripted: {message}")
     parser.add_argument("--envs", nargs="+", default=envs.IDS, choices=envs.IDS, metavar="ID", help="tasks (all)")
     parser.add_argument("--episodes", type=int, default=2000, help="of each policy on each task (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, help="JSON file to write, with the tasks that were played")
     args = parser.parse_args(argv)
     if args.episodes < 2:
-        fail("--episodes must be at least 2")
+        sys.exit("scripted: --episodes must be at least 2")
     references = {}
     print(f"{'task':16} {'policy':26} return, its standard error, discounted return, length, success")
     for env_id in args.envs:
@@ -169,7 +164,7 @@ def main(argv=None):
         try:
             args.output.write_text(json.dumps(references, indent=1) + "\n")
         except OSError as error:
-            fail(f"cannot write {args.output}: {error.strerror}")
+            sys.exit(f"scripted: cannot write {args.output}: {error.strerror}")
 
 
 if __name__ == "__main__":

@@ -33,13 +33,8 @@ from benchmark import record
 CALLS = 200
 
 
-def fail(message):
-    """Ends the program with one line."""
-    raise SystemExit(f"speed: {message}")
-
-
 def acting(script, args, rounds):
-    """Seconds of a choice and of a step for one environment: float64 [2, rounds, 1]. args: the script's."""
+    """Seconds of a choice and of a step for one environment, by measure: float64 [rounds, 1]. args: the script's."""
     env, rng = envs.make(args.env, args.num_envs), np.random.default_rng(0)
     agents, seconds = script.make_learner(args, env)["agents"], np.zeros((2, rounds, 1))
     for i in range(rounds):
@@ -52,7 +47,7 @@ def acting(script, args, rounds):
             if (over := terminations | truncations).any():
                 obs, infos = env.reset(options={"reset_mask": over})
             seconds[:, i, 0] += chosen - start, time.process_time() - chosen
-    return seconds / (CALLS * args.num_envs)
+    return dict(zip(("act", "env"), seconds / (CALLS * args.num_envs), strict=True))
 
 
 def run(checkout, name, flags):
@@ -63,13 +58,13 @@ def run(checkout, name, flags):
         threads = os.environ | {"OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, cwd=checkout, env=threads, capture_output=True, text=True, check=False)
     if done.returncode:
-        fail(f"{checkout}/{name}.py: {(done.stderr.strip().splitlines() or ['no output'])[-1]}")
+        sys.exit(f"speed: {checkout}/{name}.py: {(done.stderr.strip().splitlines() or ['no output'])[-1]}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def training(checkouts, name, args, steps, rounds):
-    """Seconds of an update and of a step of training: float64 [2, rounds, checkouts]. args: the script's."""
+    """Seconds of an update and of a step of training, by measure: float64 [rounds, checkouts]. args: the script's."""
     common = {"env": args.env, "num-envs": args.num_envs, "total-timesteps": steps, "eval-episodes": 1}
     common |= {"eval-frequency": 10**9, "checkpoint-frequency": 10**9}
     if hasattr(args, "train_frequency"):
@@ -80,12 +75,12 @@ def training(checkouts, name, args, steps, rounds):
     runs = common | {"total-timesteps": 1}, common | idle, common | learning
     seconds = [[[run(checkout, name, flags) for checkout in checkouts] for flags in runs] for _ in range(rounds)]
     begin, without, total = np.moveaxis(seconds, 1, 0)
-    return np.stack([(total - without) / updates, (total - begin) / steps])
+    return {"update": (total - without) / updates, "train": (total - begin) / steps}
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.error = fail
+    parser.error = lambda message: sys.exit(f"speed: {message}")
     add, tasks = parser.add_argument, ["wtd-s", "bp-10", "ct-10"]
     add("--scripts", nargs="+", default=record.scripts(), choices=record.scripts(), metavar="NAME", help="default: all")
     add("--envs", nargs="+", default=tasks, choices=envs.IDS, metavar="ID", help=f"default: {' '.join(tasks)}")
@@ -95,22 +90,20 @@ def main(argv=None):
     add("--against", metavar="FOLDER", type=Path, help="another checkout to compare with")
     args = parser.parse_args(argv)
     if min(args.steps, args.rounds, 1 if args.num_envs is None else args.num_envs) < 1:
-        fail("--num-envs, --steps and --rounds must be at least 1")
+        sys.exit("speed: --num-envs, --steps and --rounds must be at least 1")
     if args.against and not args.against.is_dir():
-        fail(f"--against {args.against} is no folder")
+        sys.exit(f"speed: --against {args.against} is no folder")
     torch.set_num_threads(1)
     print(f"{'measure':34} {'ms each':>9}", f"{'there':>9}  median ratio (of all rounds)" if args.against else "")
     for name, env_id in itertools.product(args.scripts, args.envs):
         script = record.load_script(name)
-        num_envs = args.num_envs or script.parse_args([f"--env={env_id}"]).num_envs
-        usual = script.parse_args([f"--env={env_id}", f"--num-envs={num_envs}"])
-        measures = (
-            {} if args.against else dict(zip(("act", "env"), acting(script, usual, 5 * args.rounds), strict=True))
-        )
+        usual = script.parse_args([f"--env={env_id}"])
+        usual.num_envs = args.num_envs or usual.num_envs
         checkouts = [record.ROOT, args.against] if args.against else [record.ROOT]
-        found = training(checkouts, name, usual, args.steps, args.rounds)
-        for kind, seconds in (measures | dict(zip(("update", "train"), found, strict=True))).items():
-            row = f"{kind} {name} {env_id} x {num_envs}"
+        measures = {} if args.against else acting(script, usual, 5 * args.rounds)
+        measures |= training(checkouts, name, usual, args.steps, args.rounds)
+        for kind, seconds in measures.items():
+            row = f"{kind} {name} {env_id} x {usual.num_envs}"
             row = f"{row:34}" + "".join(f" {1000 * each:9.4f}" for each in np.median(seconds, axis=0))
             if args.against:
                 ratios = seconds[:, 0] / seconds[:, 1]

@@ -5,11 +5,9 @@
 
 What follows -- goes to every script. Finished runs are skipped, others go on from their checkpoint, a crashed one is
 tried once more. Ctrl-C, SIGTERM and, on Linux, even the death of this program make the scripts write a checkpoint and
-end; the same command goes on. A run is the same if algorithm, task, flags, seed and code are.
-
-With --record finished runs are added to runs.csv and evaluations.csv, and what is in there is skipped. With --engine
-ray each run is a Ray task of one CPU, here or on the cluster at --address, whose nodes must have this repository and
-the runs folder under the same paths; a run whose worker is lost goes on elsewhere.
+end; the same command goes on. A run is the same if algorithm, task, flags, seed and code are. With --record finished
+runs are added to runs.csv and evaluations.csv, and what is in there is skipped. With --engine ray each run is a Ray
+task of one CPU, whose nodes must have this repository and the runs folder under the same paths.
 """
 
 import argparse
@@ -57,23 +55,9 @@ if os.getppid() == int(sys.argv[1]):
     sys.exit(code if code >= 0 else 128 - code)"""
 
 
-# A job is a dict: the KEY of a run (see record.py), variant, options (the words behind --), place (the folder of its
-# log and runs), and how it ended, with result: recorded, skipped, finished, failed, stopped, or busy (elsewhere)
+# A job is a dict: the KEY of a run (see record.py), also as a tuple, key, and in words, name; variant; options, the
+# words behind --; place, the folder of its log and runs; and how it ended: result, such as skipped or busy (elsewhere)
 NOT_RUN = {"result": "recorded", "return": "-", "time": "-", "attempts": 0, "folder": "-", "error": ""}
-
-
-def fail(message):
-    """Ends the program with one line."""
-    raise SystemExit(f"sweep: {message}")
-
-
-def key(run):
-    """Which run a job or a row of runs.csv is of."""
-    return tuple(run[name] for name in record.KEY)
-
-
-def name(job):
-    return f"{job['algorithm']} {job['env']} seed {job['seed']}"
 
 
 def find_run(job):
@@ -121,7 +105,7 @@ def run_job(job):
                 result = "failed"
             else:
                 if attempts:
-                    print(f"{name(job)}: {error}; tried once more", file=sys.stderr)
+                    print(f"{job['name']}: {error}; tried once more", file=sys.stderr)
                 attempts += 1
                 code = run_script(job, folder, log)
                 error = f"exit code {code}: {path.read_text(errors='replace').splitlines()[-1]}"
@@ -131,17 +115,16 @@ def run_job(job):
 
 def run_script(job, folder, log):
     """Runs a job's script, or goes on with a run folder, passes the signals in `stop` on, returns its exit code."""
-    new = ["--env={env}", "--seed={seed}", "--runs-dir={place}"]
-    flags = [f"--resume={folder}"] if folder else [flag.format(**job) for flag in new] + job["options"]
-    command = [str(record.ROOT / f"{job['algorithm']}.py"), *flags]
+    new = [f"--env={job['env']}", f"--seed={job['seed']}", f"--runs-dir={job['place']}", *job["options"]]
+    command = [str(record.ROOT / f"{job['algorithm']}.py"), *([f"--resume={folder}"] if folder else new)]
     print(time.strftime("=== %F %T"), os.uname().nodename, shlex.join(command), file=log, flush=True)
     origin = {name: job[name] for name in ("flags", "variant", "checksum")}
     origin |= {"commit": record.commit(), "processor": record.processor()}
     record.replace_text(Path(job["place"]) / record.ORIGIN, json.dumps(origin, indent=2) + "\n")
     # In a process group of its own: Ctrl-C would reach it from the terminal, too, and the scripts want it once
-    streams = dict(stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+    options = dict(stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=os.environ | {"OMP_NUM_THREADS": "1"})
     guarded = [sys.executable, "-c", GUARD, str(os.getpid()), *command]
-    process = subprocess.Popen(guarded, env={**os.environ, "OMP_NUM_THREADS": "1"}, process_group=0, **streams)
+    process = subprocess.Popen(guarded, process_group=0, **options)
     code, passed = None, 0
     while code is None:
         try:
@@ -176,9 +159,9 @@ def start_ray(args):
         ray.cloudpickle.register_pickle_by_value(record)  # workers do not find this repository's modules
         ray.init(args.address, num_cpus=args.workers)
     except ImportError:
-        fail("--engine ray needs Ray: pip install -e '.[cluster]'")
+        sys.exit("sweep: --engine ray needs Ray: pip install -e '.[cluster]'")
     except (ConnectionError, ValueError, RuntimeError) as error:
-        fail(f"cannot reach Ray: {str(error).splitlines()[0]}")
+        sys.exit(f"sweep: cannot reach Ray: {str(error).splitlines()[0]}")
     return run_there
 
 
@@ -204,21 +187,22 @@ def run_jobs(jobs, args):
             except Exception as error:  # the engine's own: an unwritable log, or workers lost once too often
                 job |= {"result": "stopped" if stop else "failed", "error": repr(error).strip().splitlines()[-1]}
             bar.update()
-            ended = f"[{done}/{len(jobs)}] {name(job)}: {job['result']}, {job['time']}, return {job['return']}"
+            ended = f"[{done}/{len(jobs)}] {job['name']}: {job['result']}, {job['time']}, return {job['return']}"
             tqdm.write(ended, sys.stderr)
 
 
 def seeds(text):
     """Those of a word such as 3 or 1-5."""
-    ends = [int(end) for end in text.split("-")]
-    if len(ends) > 2 or ends[0] > ends[-1]:
+    first, _, last = text.partition("-")
+    found = range(int(first), int(last or first) + 1)
+    if not found:
         raise ValueError
-    return range(ends[0], ends[-1] + 1)
+    return found
 
 
 def make_jobs(args, options):
     """The jobs of a sweep. Bad flags behind -- end the program, bad values of them in the words of the script."""
-    cells = []
+    cells, jobs = [], []
     for algorithm, env in dict.fromkeys(itertools.product(args.algos, args.envs)):
         usual = {"env": env, "seed": 2**31 - 1, "runs_dir": "runs of a sweep"}  # that differ from any behind --
         own = [f"--{name.replace('_', '-')}={value}" for name, value in usual.items()]
@@ -226,26 +210,28 @@ def make_jobs(args, options):
             arguments = asdict(record.load_script(algorithm).parse_args([*own, *options]))
         except SystemExit as stopped:
             if stopped.code == 2:  # the parser has told what it does not know, but not whose it is
-                fail(f"{algorithm} does not take {shlex.join(options)}")
+                sys.exit(f"sweep: {algorithm} does not take {shlex.join(options)}")
             raise
         if not usual.items() <= arguments.items():
-            fail("--env, --seed and --runs-dir cannot stand behind --, the sweep sets them")
-        flags, variant = record.flags_of(algorithm, arguments), args.variant
-        cell = {"algorithm": algorithm, "env": env, "flags": flags, "checksum": record.checksum(algorithm, env)}
-        cells.append(NOT_RUN | cell | {"variant": flags if variant is None else variant, "options": options})
+            sys.exit("sweep: --env, --seed and --runs-dir cannot stand behind --, the sweep sets them")
+        cells.append((algorithm, env, record.flags_of(algorithm, arguments), record.checksum(algorithm, env)))
     # All of the first seed before the second, so that a sweep of days soon shows something of everything
-    numbers = dict.fromkeys(itertools.chain.from_iterable(args.seeds))
-    jobs = [cell | {"seed": str(seed)} for seed in numbers for cell in cells]
-    for job in jobs:
-        place = "{env}__{algorithm}__{seed}__{:08x}".format(zlib.crc32(repr(key(job)).encode()), **job)
-        job["place"] = str(args.runs_dir.resolve() / place)
+    for seed, cell in itertools.product(dict.fromkeys(itertools.chain.from_iterable(args.seeds)), cells):
+        algorithm, env, flags, code = cell
+        key = algorithm, env, flags, str(seed), code
+        place = args.runs_dir.resolve() / f"{env}__{algorithm}__{seed}__{zlib.crc32(repr(key).encode()):08x}"
+        job = dict(zip(record.KEY, key, strict=True)) | dict(key=key, name=f"{algorithm} {env} seed {seed}")
+        job |= dict(variant=flags if args.variant is None else args.variant, options=options, place=str(place))
+        jobs.append(job | NOT_RUN)
     return jobs
 
 
-def parse_args(argv):
-    """The sweep's own arguments, and the list of the scripts' flags behind --."""
+def main(argv=None):
+    """Runs a sweep; returns 0 if every run is finished, 128 + the signal if it was stopped, 1 otherwise."""
+    argv = sys.argv[1:] if argv is None else argv
+    cut = argv.index("--") if "--" in argv else len(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.error = fail
+    parser.error = lambda message: sys.exit(f"sweep: {message}")
     add, names = parser.add_argument, dict(nargs="+", required=True, metavar="NAME")
     add("--algos", choices=record.scripts(), help="names of scripts, without .py", **names)
     add("--envs", choices=envs.IDS, help="ids of tasks", **names)
@@ -257,41 +243,33 @@ def parse_args(argv):
     add("--engine", choices=("local", "ray"), default="local", help="default: local")
     add("--address", help="with --engine ray: of a cluster, or auto (default: starts one here)")
     add("--dry-run", action="store_true", help="only list what would be run, resumed and skipped")
-    cut = argv.index("--") if "--" in argv else len(argv)
     args = parser.parse_args(argv[:cut])
     if args.workers is not None and args.workers < 1:
-        fail(f"--workers must be at least 1, got {args.workers}")
+        sys.exit(f"sweep: --workers must be at least 1, got {args.workers}")
     if args.address and (args.engine != "ray" or args.workers):
-        fail("--address needs --engine ray, and no --workers: the cluster has the CPUs it has")
+        sys.exit("sweep: --address needs --engine ray, and no --workers: the cluster has the CPUs it has")
     args.workers = args.workers or (None if args.address else os.cpu_count())
-    return args, argv[cut + 1 :]
-
-
-def main(argv=None):
-    """Runs a sweep; returns 0 if every run is finished, 128 + the signal if it was stopped, 1 otherwise."""
-    argv = sys.argv[1:] if argv is None else argv
-    args, options = parse_args(argv)
-    jobs, recorded = make_jobs(args, options), set()
+    jobs, recorded = make_jobs(args, argv[cut + 1 :]), set()
     try:
         for folder in [] if args.dry_run else filter(None, (args.runs_dir, args.record)):
             folder.mkdir(parents=True, exist_ok=True)
         if args.record:
-            recorded = {key(run) for run in record.load(args.record)[0].to_dict("records")}
+            recorded = set(record.load(args.record)[0][record.KEY].itertuples(index=False, name=None))
     except (OSError, ValueError) as error:
-        fail(f"cannot use --record or --runs-dir: {error}")
-    todo = [job for job in jobs if key(job) not in recorded]
+        sys.exit(f"sweep: cannot use --record or --runs-dir: {error}")
+    todo = [job for job in jobs if job["key"] not in recorded]
+    for job in jobs if args.dry_run else ():
+        folder, finished = find_run(job)
+        how = "recorded" if job not in todo else "skip" if finished else "resume" if folder else "run"
+        print(f"{job['name']}: {how} {folder or ''}".rstrip())
     if args.dry_run:
-        for job in jobs:
-            folder, finished = find_run(job)
-            how = "recorded" if job not in todo else "skip" if finished else "resume" if folder else "run"
-            print(f"{name(job)}: {how} {folder or ''}".rstrip())
         return 0
     run_jobs(todo, args)
     columns = ["algorithm", "env", "seed", "result", "return", "time", "attempts", "folder"]
     print(pd.DataFrame(jobs)[columns].to_string(index=False))
     for job in jobs:
         if job["result"] == "failed":
-            print(f"{name(job)} failed: {job['error']} (log: {Path(job['place']) / LOG})")
+            print(f"{job['name']} failed: {job['error']} (log: {Path(job['place']) / LOG})")
     if stop:
         command = shlex.join([sys.argv[0], *argv])
         print(f"sweep: stopped, nothing is lost; go on with: python {command}", file=sys.stderr)

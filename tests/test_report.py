@@ -1,5 +1,6 @@
 """benchmark/report.py: its statistics by hand, and reports of runs that were written for the purpose."""
 
+import itertools
 import json
 import re
 import subprocess
@@ -9,6 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
@@ -28,13 +30,14 @@ REFERENCES = {
         "scripted": {"name": "x", "optimal": False, "return": 0.5, "se": 0.0, "discounted_return": 0.1, "success": 0.5},
     },
 }  # fmt: skip
-REFERENCES["bp-20"] = REFERENCES["wtd-s"]
+REFERENCES["bp-20"] = REFERENCES["bp-10-primitive"] = REFERENCES["wtd-s"]
 
 
 @pytest.fixture(autouse=True)
 def quick(request, monkeypatch):
-    """Figures are drawn where they are what is tested."""
+    """Figures are drawn where they are what is tested; few resamples do, where the runs have few different means."""
     monkeypatch.setattr(report, "REFERENCES", REFERENCES)
+    monkeypatch.setattr(report, "RESAMPLES", 1_000)
     if "figure" not in request.node.name:
         monkeypatch.setattr(report, "plot", lambda *_: None)
 
@@ -51,13 +54,12 @@ def test_interquartile_mean():
 
 def test_intervals_redraw_within_samples():
     """Of three runs 0, 0, 1 the mean is 1 in 1/27 = 3.7% of the resamples, more than the 2.5% above the interval."""
-    assert report.interval([np.array([0.0, 0, 1])], report.iqm).tolist() == [0, 1]
+    assert report.with_interval(report.iqm, [np.array([0.0, 0, 1])], 1) == "0.3 [0.0, 1.0]"
     # two tasks with equal runs each: nothing varies, unless runs are redrawn across tasks
-    assert report.interval([np.zeros(2), np.ones(2)], report.iqm).tolist() == [0.5, 0.5]
-    assert np.isnan(report.interval([np.array([3.0])], report.iqm)).all()
-    curves = np.random.default_rng(1).normal(size=(3, 20))
-    whole = report.interval([curves], report.iqm)
-    assert whole.shape == (2, 3) and (whole == report.interval([curves], report.iqm)).all()
+    assert report.with_interval(report.iqm, [np.zeros(2), np.ones(2)], 2) == "0.50 [0.50, 0.50]"
+    assert report.with_interval(report.iqm, [np.array([3.0])], 1) == "3.0"
+    noise = np.random.default_rng(1).normal(size=20)
+    assert report.with_interval(report.iqm, [noise], 6) == report.with_interval(report.iqm, [noise], 6)
 
 
 def test_probability_of_improvement():
@@ -67,7 +69,7 @@ def test_probability_of_improvement():
     assert report.improvement(y, x) == 0.625
     assert report.improvement(x, np.array([5.0]), y, y) == (0.375 + 1) / 2
     # x is redrawn as 1 1 in 1/4 of the resamples, which wins nothing, and as 3 3 in 1/4: against 2 2 it wins all
-    assert report.interval([x, y], report.improvement).tolist() == [0, 1]
+    assert report.with_interval(report.improvement, [x, y], 3) == "0.375 [0.000, 1.000]"
 
 
 # Reports
@@ -106,10 +108,20 @@ def make(output, *arguments):
     return (output / "README.md").read_text()
 
 
-def rows(text, label):
-    """The cells of the table rows that start with a label."""
-    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
-    return [line[1:] for line in lines if line[0] == label]
+def section(text, title):
+    """The text of a section."""
+    return text.split(f"## {title}\n")[1].split("\n## ")[0]
+
+
+def rows(text, *start):
+    """The rows of tables that start with these cells, the rest of each as {column: cell}."""
+    found, columns = [], None
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")] if line[:1] == "|" else None
+        columns = (cells and columns) or cells
+        if cells and tuple(cells[: len(start)]) == start:
+            found.append(dict(zip(columns, cells, strict=True)))
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -128,41 +140,110 @@ def test_a_report_by_hand(runs, tmp_path, capsys):
     """Solved is 58.8, 98% of 60, or more five times: rising(62) is, at 60 and above, and rising(60) is not, at 58."""
     text = make(tmp_path, runs)
     assert capsys.readouterr() == (f"{tmp_path / 'README.md'}\n", "")
-    main, variants = text.split("## wtd-s\n")[1].split("## wtd-s: variants of AVF-QMIX\n")
+    assert [line[3:] for line in text.splitlines() if line[:3] == "## "] == ["Figure 4", "Figure 5", "Sources"]
+    figure_4, figure_5 = section(text, "Figure 4"), section(text, "Figure 5")
     # 10, 20, 62: mean 30.667, squares 427.1 + 113.8 + 981.8 = 1522.7, / 2 = 761.3, root 27.59, / root 3 = 15.93;
     # one of three: 1 - (1 - p)^3 = 0.025 at p = 0.0084, and 0.025 = (1 - p)^3 + 3 p (1 - p)^2 at p = 0.906
-    performance, matrix = rows(main, "AVF-QPLEX")
-    assert performance[:4] == ["3", "600,000", "30.7 ± 15.9", "30.7 [10.0, 62.0]"]
-    assert performance[4:] == ["1 of 3 [0.01, 0.91]", "15.3 ± 8.0", "0.33", "6.0 min"]
-    assert rows(main, "AVF-QMIX")[0][4] == "0 of 3 [0.00, 0.71]"
+    assert rows(figure_4, "wtd-s", "AVF-QPLEX") == [{
+        "task": "wtd-s", "": "AVF-QPLEX", "runs": "3", "return: mean ± SE": "30.7 ± 15.9", "discounted": "15.3 ± 8.0",
+        "IQM [95%]": "30.7 [10.0, 62.0]", "solved [95%]": "1 of 3 [0.01, 0.91]", "floor": "-40.0", "ceiling": "60.0",
+        "steps": "600,000", "time": "6.0 min",
+    }]  # fmt: skip
+    assert rows(figure_4, "wtd-s", "AVF-QMIX")[0]["solved [95%]"] == "0 of 3 [0.00, 0.71]"
     # against 20, 5, 60: 10 wins once, 20 wins once and ties once, 62 wins three times: 5.5 of 9 pairs
-    assert matrix[0] == "" and matrix[1].startswith("0.61 [")
-    assert rows(main, "*random*") == [["", "", "-40.0 ± 1.5", "", "", "-20.0", "0.25", ""]]
-    assert rows(main, "*fixed loads*")[0][2] == "60.0 ± 0.0"
-    single = rows(variants, "mixer_state=single")[0]
-    assert single[:5] == ["1", "600,000", "-10.0", "-10.0", "0 of 1 [0.00, 0.97]"]
-    assert rows(variants, "AVF-QMIX")[0][:3] == ["3", "600,000", "28.3 ± 16.4"]
-    assert rows(text.split("## wtd-s\n")[0], "AVF-QPLEX") == [["30.7 [10.0, 62.0]"]]
-    sources = [row for row in rows(text, "avf_qmix") if row[0] == "wtd-s"]
-    assert [row[1] for row in sources] == ["", "mixer_state=single"]
-    assert [row[-1] for row in sources] == ["1 2 3", "1"]
+    assert rows(figure_4, "AVF-QPLEX > AVF-QMIX")[0]["wtd-s"].startswith("0.61 [")
+    (single,) = rows(figure_5, "wtd-s AVF-QMIX", "single")
+    assert (single["runs"], single["return: mean ± SE"], single["IQM [95%]"]) == ("1", "-10.0", "-10.0")
+    assert single["solved [95%]"] == "0 of 1 [0.00, 0.97]"
+    assert rows(figure_5, "wtd-s AVF-QMIX", "joint")[0]["return: mean ± SE"] == "28.3 ± 16.4"
+    assert rows(figure_5, "joint > single")[0]["wtd-s AVF-QMIX"] == "1.00"
+    sources = rows(section(text, "Sources"), "avf_qmix")
+    assert [(row["flags"], row["env"], row["seed"]) for row in sources] == [
+        ("", "wtd-s", "1 2 3"), ("mixer_state=single", "wtd-s", "1"),
+    ]  # fmt: skip
+    assert "No runs yet: Table 1; Figure 8; Table 3; " in text, "and the others of which nothing is new"
+
+
+def test_every_run_is_in_a_section_once_it_is_in_none_of_the_papers(tmp_path):
+    """Half of the grid is a report of that half, and runs of one's own are beside the others on their task."""
+    write_run(tmp_path / "runs", "avf_qplex", "wtd-s", 1, rising(20))
+    write_run(tmp_path / "runs", "avf_qmix", "ct-10", 1, rising(0.5), gamma=0.5)
+    write_run(tmp_path / "runs", "cen_maddrqn", "wtd-s", 1, rising(10))
+    text = make(tmp_path, tmp_path / "runs")
+    assert [row["task"] for row in rows(section(text, "Figure 4"), "wtd-s")] == ["wtd-s"]
+    titles = [line[3:] for line in text.splitlines() if line[:3] == "## "]
+    assert titles == ["Figure 4", "Other runs", "Sources"], "the others would show nothing new"
+    own = section(text, "Other runs")
+    assert [row[""] for row in rows(own, "wtd-s")] == ["AVF-QPLEX", "Cen-MADDRQN"]
+    assert rows(own, "ct-10", "AVF-QMIX gamma=0.5") and rows(own, "AVF-QPLEX > Cen-MADDRQN")[0]["wtd-s"] == "1.00"
+    assert "Other runs" not in text.split("No runs yet")[1]
+
+
+def test_the_papers_numbers_stand_beside_ours(tmp_path):
+    for algorithm in ("avf_vdn", "mac_iaicc"):
+        write_run(tmp_path / "runs", algorithm, "ct-10", 1, dict.fromkeys(STEPS, 0.25))
+    write_run(tmp_path / "runs", "avf_qplex", "bp-10-primitive", 1, dict.fromkeys(STEPS, 25.0))
+    text = make(tmp_path, tmp_path / "runs")
+    papers = {name: row["paper"] for name in ("AVF-VDN", "Mac-IAICC") for row in rows(text, "ct-10", name)}
+    assert papers == {"AVF-VDN": "0.13 ± 0.05", "Mac-IAICC": "0.29 ± 0.06"}
+    (primitive,) = rows(text, "bp-10-primitive", "AVF-QPLEX")
+    assert primitive["paper"] == "13.4 ± 2.6" and primitive["return: mean ± SE"] == "25.0"
+    ct = rows(text, "ct-10", "AVF-VDN")[0]
+    assert ct["IQM [95%]"] == "0.250" and ct["solved [95%]"] == "no optimum known"
+
+
+def test_the_papers_numbers_are_the_papers():
+    """Of Table 1 and Table 3, by rows."""
+    one, three = (report.PAPER["sections"][title]["paper"] for title in ("Table 1", "Table 3"))
+    names = ["Dec-MADDRQN", "Cen-MADDRQN", "AVF-VDN", "AVF-QMIX", "AVF-QPLEX", "Mac-IAICC"]
+    assert " ".join(one["ct-10"][name] for name in names) == (
+        "0.05 ± 0.02 0.35 ± 0.09 0.13 ± 0.05 0.26 ± 0.08 0.61 ± 0.09 0.29 ± 0.06"
+    )
+    lines = {env: " | ".join(by[name] for name in names[2:5]) for env, by in three.items()}
+    assert lines == {
+        "bp-10-primitive": "-4.1 ± 10.5 | -2.0 ± 9.3 | 13.4 ± 2.6",
+        "wtd-s-primitive": "32 ± 4.5 | 44 ± 6.2 | 61 ± 5.3",
+        "ct-10-primitive": "0.04 ± 0.01 | 0.09 ± 0.03 | 0.20 ± 0.04",
+    }
+
+
+def test_the_grid_has_the_runs_of_every_panel():
+    """grid.sh records what paper.json compares, under the names of its variants, and nothing else."""
+    grid = set()
+    for words in re.findall(r"^python benchmark/sweep.py (.*)$", (ROOT / "benchmark" / "grid.sh").read_text(), re.M):
+        own, _, flags = words.partition(" -- ")
+        given = {name: values for name, *values in (part.split() for part in own.split("--")[1:])}
+        for algorithm, env in itertools.product(given["algos"], given["envs"]):
+            args = vars(record.load_script(algorithm).parse_args([f"--env={env}", *flags.split()]))
+            grid.add((env, algorithm, *given.get("variant", [record.flags_of(algorithm, args)])))
+    compared = {("bp-30", "mac_iaicc", "same-time"), ("wtd-t1", "mac_iaicc", "same-time")}
+    for panels in report.PAPER["sections"].values():
+        for panel in itertools.chain.from_iterable(panels["panels"]):
+            env, *algorithm = panel.split()
+            compared |= {(env, name, "") for name in algorithm or panels["algorithms"]}
+            compared |= {(env, *algorithm, variant) for variant in panels["variants"] if algorithm}
+    own_discount = {("bp", "discount=decision"), ("wtd", "discount=step")}  # the defaults
+    assert grid == {run for run in compared if (run[0].split("-")[0], run[2]) not in own_discount}
 
 
 @pytest.fixture
 def kept(runs, tmp_path):
     for folder in sorted(file.parent for file in runs.rglob("args.json")):
         run, evaluations = record.read_folder(folder)
-        record.add(tmp_path / "kept", run | {"variant": "real" if "single" in run["flags"] else ""}, evaluations)
+        record.add(tmp_path / "kept", run | {"variant": "mine" if "single" in run["flags"] else ""}, evaluations)
     return tmp_path / "kept"
 
 
 def test_recorded_runs_give_the_report_of_their_folders(runs, kept, tmp_path):
-    text = make(tmp_path / "a", runs).replace("mixer_state=single", "real")
-    again = make(tmp_path / "b", kept)
-    assert again.replace("mixer_state=single", "real") == text
+    text, again = make(tmp_path / "a", runs), make(tmp_path / "b", kept)
+    assert section(again, "Figure 4") == section(text, "Figure 4")
+    assert [row[""] for row in rows(section(again, "Other runs"), "wtd-s")][2:] == ["AVF-QMIX mine"], (
+        "its variant's name"
+    )
     write_run(tmp_path / "runs", "avf_vdn", "wtd-s", 1, rising(40))
     both = make(tmp_path / "c", kept, tmp_path / "runs")
-    assert rows(both, "AVF-VDN") and rows(both, "AVF-QPLEX")[1] == rows(text, "AVF-QPLEX")[1]
+    assert rows(section(both, "Figure 4"), "wtd-s", "AVF-VDN")
+    assert rows(both, "wtd-s", "AVF-QPLEX")[0] == rows(text, "wtd-s", "AVF-QPLEX")[0]
 
 
 def test_a_resumed_run(tmp_path):
@@ -177,7 +258,7 @@ def test_a_resumed_run(tmp_path):
     assert evaluations["return"].tolist() == list("123456")
     assert run["seconds"] == "345", "45 and 300, without the pause"
     assert run["date"] == "1970-01-12 13:46:40" and run["steps"] == "600000"
-    assert rows(make(tmp_path, folder), "AVF-QPLEX")[1][2] == "4.0"
+    assert rows(make(tmp_path, folder), "wtd-s", "AVF-QPLEX")[0]["return: mean ± SE"] == "4.0"
 
 
 def test_what_is_left_out_is_said(tmp_path, capsys):
@@ -205,51 +286,23 @@ def test_what_is_left_out_is_said(tmp_path, capsys):
     assert "seed 1 of 1970-01-01 00:16:40: left out, there is a newer one" in notes[-1]
     assert capsys.readouterr().err.count("report: ") == len(notes) == 7
     assert str(tmp_path) not in text
-    assert rows(text, "AVF-QPLEX")[1][:3] == ["2", "600,000", "35.0 ± 5.0"], "30 and 40"
+    (row,) = rows(text, "wtd-s", "AVF-QPLEX")
+    assert (row["runs"], row["return: mean ± SE"]) == ("2", "35.0 ± 5.0"), "30 and 40"
 
 
-def test_half_a_grid_and_all_tasks(tmp_path):
-    """Scaled: wtd-s 10 and 35 are 0.5 and 0.75 of the way from -40 to 60, ct-10 0.25 and 0.75 of the way to 0.5."""
-    for seed, wtd, ct in ((1, 10.0, 0.125), (2, 35.0, 0.375)):
+def test_over_all_tasks(tmp_path):
+    """Scaled: on wtd-s 10 and 35 are 0.5 and 0.75 of the way from -40 to 60, on bp-20 -15 and 35 are 0.25 and 0.75."""
+    for seed, wtd, bp in ((1, 10.0, -15.0), (2, 35.0, 35.0)):
         write_run(tmp_path / "runs", "avf_qplex", "wtd-s", seed, dict.fromkeys(STEPS, wtd))
-        write_run(tmp_path / "runs", "avf_qplex", "ct-10", seed, dict.fromkeys(STEPS, ct))
+        write_run(tmp_path / "runs", "avf_qplex", "bp-20", seed, dict.fromkeys(STEPS, bp))
     write_run(tmp_path / "runs", "avf_qmix", "wtd-s", 1, dict.fromkeys(STEPS, 0.0))
     text = make(tmp_path, tmp_path / "runs")
     # 0.25 0.5 0.75 0.75 without the lowest and the highest
-    assert rows(text, "AVF-QPLEX")[0][0::2] == ["22.5 [10.0, 35.0]", "0.625 [0.375, 0.750]"]
-    assert rows(text, "AVF-QMIX")[0] == ["0.0", "", ""], "no runs on ct-10, so no number for both tasks"
-    ct = rows(text.split("## ct-10")[1], "AVF-QPLEX")[0]
-    assert ct[2] == "0.250 ± 0.125" and ct[4] == "", "no optimum is known"
-
-
-def test_variants(tmp_path):
-    """Algorithms are compared where they have the same variant, and unequal numbers of steps are pointed out."""
-    for algorithm, flags in (("avf_qplex", {}), ("avf_qmix", {}), ("avf_qmix", {"gamma": 0.9}), ("avf_vdn", {})):
-        flags |= {"gamma": 0.8} if algorithm == "avf_vdn" else {}
-        write_run(tmp_path / "runs", algorithm, "wtd-s", 1, rising(10), 1_000 + len(flags), **flags)
-    text = make(tmp_path, tmp_path / "runs")
-    titles = [line[3:] for line in text.splitlines() if line.startswith("## ")]
-    assert titles == ["wtd-s", "wtd-s: gamma=0.8", "wtd-s: variants of AVF-QMIX", "Sources"]
-    assert "budgets" not in text
-    write_run(tmp_path / "runs", "avf_vdn", "wtd-s", 1, dict.fromkeys([*STEPS, 700_000], 1.0), gamma=0.9)
-    text = make(tmp_path, tmp_path / "runs")
-    titles = [line[3:] for line in text.splitlines() if line.startswith("## ")]
-    assert titles[1:3] == ["wtd-s: gamma=0.9", "wtd-s: variants of AVF-QMIX"] and "variants of AVF-VDN" in titles[3]
-    assert text.count("**The rows differ in their environment steps**") == 2
-
-
-def test_runs_of_changed_code_are_pointed_out(kept, tmp_path):
-    assert "several versions" not in make(tmp_path, kept)
-    text = (kept / "runs.csv").read_text().splitlines()
-    one = next(i for i, line in enumerate(text) if line.startswith("avf_qplex"))
-    cells = text[one].split(",")
-    cells[record.RUNS.index("checksum")] = "other"
-    (kept / "runs.csv").write_text("\n".join([*text[:one], ",".join(cells), *text[one + 1 :]]) + "\n")
-    evaluations = (kept / "evaluations.csv").read_text().splitlines()
-    old = [line for line in evaluations if line.startswith("avf_qplex") and line.split(",")[3] == cells[3]]
-    changed = [line.replace(f",{cells[3]},,", f",{cells[3]},other,") if line in old else line for line in evaluations]
-    (kept / "evaluations.csv").write_text("\n".join(changed) + "\n")
-    assert "**Some rows have runs of several versions of the code.**" in make(tmp_path, kept)
+    (both,) = rows(text, "all, scaled")
+    assert both[""] == "AVF-QPLEX", "there are no runs of AVF-QMIX on bp-20"
+    assert both["IQM [95%]"] == "0.625 [0.375, 0.750]"
+    (pair,) = rows(text, "AVF-QPLEX > AVF-QMIX")
+    assert (pair["wtd-s"], pair.get("all", "")) == ("1.00", "")
 
 
 # Figures
@@ -257,8 +310,8 @@ def test_runs_of_changed_code_are_pointed_out(kept, tmp_path):
 
 def test_figures_show_every_curve(runs, tmp_path):
     text = make(tmp_path, runs)
-    expected = {"wtd-s.png": ["#D55E00", "#0072B2"], "wtd-s_variants_of_AVF-QMIX.png": ["#0072B2", report.OTHERS[0][0]]}
-    expected["overview.png"] = expected["wtd-s.png"]
+    others = [colour for colour, _ in report.PAPER["other styles"]]
+    expected = {"figure-4.png": ["#D55E00", "#0072B2"], "figure-5.png": others[:2]}
     assert {path.name for path in tmp_path.glob("*.png")} == expected.keys()
     for name, colours in expected.items():
         assert f"({name})" in text
@@ -268,29 +321,38 @@ def test_figures_show_every_curve(runs, tmp_path):
             assert (np.abs(pixels - rgb).max(2) < 8).sum() > 200, (name, colour)
 
 
-def test_figures_of_the_paper_appear_with_runs_of_each_row(tmp_path):
-    for env in ("bp-20", "wtd-s"):
-        write_run(tmp_path / "runs", "avf_qplex", env, 1, rising(10))
-    assert "![figure-4](figure-4.png)" in make(tmp_path, tmp_path / "runs")
-    assert (tmp_path / "figure-4.png").exists()
+def test_figure_4_has_the_papers_layout(tmp_path, monkeypatch):
+    """3 + 4 panels, those without runs empty, and rows without runs not there."""
+    made = []
+    monkeypatch.setattr(plt, "close", made.append)
+    write_run(tmp_path / "runs", "avf_qplex", "bp-20", 1, rising(10))
+    make(tmp_path, tmp_path / "runs")
+    write_run(tmp_path / "runs", "avf_qplex", "wtd-s", 1, rising(10))
+    make(tmp_path, tmp_path / "runs")
+    one, two = ([ax.get_title() for ax in figure.axes] for figure in made)
+    assert one == ["bp-10: no runs yet", "bp-20", "bp-30: no runs yet"]
+    assert two == [*one, "wtd-s", *(f"wtd-{name}: no runs yet" for name in ("d", "t", "t1"))]
 
 
 def test_curves_of_figures_by_hand(tmp_path):
-    """Of 0.1, 0.2, 0.6: mean 0.3, standard error 0.15275, IQM the mean, lowest and highest 0.1 and 0.6."""
+    """Of 0.1, 0.2, 0.6: mean 0.3, standard error 0.15275. A variant may go on for longer than is shown."""
     for seed, value in ((1, 0.1), (2, 0.2), (3, 0.6)):
         write_run(tmp_path, "avf_qplex", "ct-10", seed, dict.fromkeys(STEPS, value))
+    longer = dict.fromkeys([*STEPS, 900_000], 0.5)
+    write_run(tmp_path, "avf_qplex", "ct-10", 1, longer, started=2_000, total_timesteps=900_000)
     runs, evaluations, notes = report.read_runs([tmp_path])
-    section = report.make_sections(runs)
-    assert not notes and set(section["section"]) == {"ct-10"}
-    for kind, middle, low, high in (("mean", 0.3, 0.14725, 0.45275), ("IQM", 0.3, 0.1, 0.6)):
-        ax = Figure().subplots()
-        report.draw(ax, section, evaluations, kind)
-        lines = {line.get_label(): line for line in ax.lines}
-        assert lines["AVF-QPLEX"].get_xdata() == pytest.approx(range(100, 700, 100))
-        assert lines["AVF-QPLEX"].get_ydata() == pytest.approx([middle] * 6)
-        assert lines["random policy"].get_ydata()[0] == 0 and lines["scripted policy"].get_ydata()[0] == 0.5
-        band = ax.collections[0].get_paths()[0].vertices[:, 1]
-        assert (band.min(), band.max()) == pytest.approx((low, high), abs=1e-5)
+    panels = report.panels_of({"panels": [["ct-10"]]}, runs)
+    labels = ["AVF-QPLEX", "AVF-QPLEX total_timesteps=900000"]
+    assert not notes and list(panels["ct-10"]["label"].unique()) == labels
+    ax = Figure().subplots()
+    report.draw(ax, panels["ct-10"], evaluations, dict.fromkeys(labels, ("red", "o")))
+    lines = {line.get_label(): line for line in ax.lines}
+    assert lines["AVF-QPLEX"].get_xdata() == pytest.approx(range(100, 700, 100))
+    assert lines["AVF-QPLEX"].get_ydata() == pytest.approx([0.3] * 6)
+    assert lines["random policy"].get_ydata()[0] == 0 and lines["scripted policy"].get_ydata()[0] == 0.5
+    assert ax.get_xlim() == (0, 600) and lines[labels[1]].get_xdata()[-1] == 900
+    band = ax.collections[0].get_paths()[0].vertices[:, 1]
+    assert (band.min(), band.max()) == pytest.approx((0.14725, 0.45275), abs=1e-5)
 
 
 # The command line
@@ -303,8 +365,8 @@ def test_bad_input_is_one_line(runs, tmp_path):
     (tmp_path / "file").write_text("")
     write_run(tmp_path / "cut", "avf_qplex", "wtd-s", 1, {1000: 0.0})
     for arguments, message in [
-        ([tmp_path / "empty"], "no runs found in"),
-        ([runs, tmp_path / "nowhere"], "no runs found in"),
+        ([tmp_path / "empty"], "no finished run found"),
+        ([runs, tmp_path / "nowhere"], "cannot read"),
         ([tmp_path / "bad"], "cannot read"),
         ([tmp_path / "cut"], "no finished run found"),
         ([runs, "-o", tmp_path / "file"], "cannot write to"),
@@ -321,7 +383,7 @@ def test_the_program(tmp_path):
     command = [sys.executable, ROOT / "benchmark" / "report.py", "kept", "-o", "new/report"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "new/report/README.md\n", "")
-    assert {path.name for path in (tmp_path / "new" / "report").iterdir()} == {"README.md", "overview.png", "wtd-s.png"}
+    assert {path.name for path in (tmp_path / "new" / "report").iterdir()} == {"README.md", "figure-4.png"}
 
 
 def test_the_report_in_this_repository_is_that_of_its_results(tmp_path, monkeypatch):
