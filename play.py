@@ -1,10 +1,11 @@
-"""Watches what a script has saved: figures of merit, an animation and a timeline of macro-actions.
+"""Watches what a script has saved: figures of merit, an animation, a timeline of macro-actions, rows for learning.
 
     python play.py runs/<folder> --gif team.gif --timeline team.png
+    python play.py runs/<folder> --rows 0-8
 
-The model plays --episodes greedy episodes side by side, of which means and standard errors are printed. The animation
-and the timeline show the first of them, that of environment 0 (so, where a task has chance, another one for another
---episodes).
+The model plays --episodes greedy episodes side by side, of which means and standard errors are printed. Animation,
+timeline and rows are those of the first of them, that of environment 0 (so, where a task has chance, of another one for
+another --episodes).
 """
 
 import argparse
@@ -13,6 +14,7 @@ import json
 import os
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,18 +25,32 @@ import timeline
 from envs import rendering
 
 SCRIPTS = ("avf_vdn", "avf_qmix", "avf_qplex", "dec_maddrqn", "cen_maddrqn", "mac_iaicc")
+COLUMNS = 120  # of the terminal in which rows are printed
 
 
 # ---- watching an episode --------------------------------------------------------------------------------------------
+class Step(NamedTuple):
+    """A step of environment 0 and what stands before and after it, arrays [1, ...] as of a batch of one."""
+
+    obs: np.ndarray
+    infos: dict
+    said: torch.Tensor | None  # float32 [n, A], what the agents' networks said before it
+    rewards: np.ndarray
+    terminated: np.ndarray
+    over: np.ndarray  # terminated or truncated
+    next_obs: np.ndarray
+    next_infos: dict
+
+
 class Recorder:
     """Behaves as the batch of environments it is given and records the first episode of environment 0.
 
-    frames: a list that receives its pictures, or None.
+    frames: a list that receives its pictures, or None. probabilities: what the networks say are logits.
     """
 
-    def __init__(self, env, frames=None):
-        self.env, self.frames = env, frames
-        self.steps, self.free, self.said, self.over = [], None, None, False
+    def __init__(self, env, frames=None, probabilities=False):
+        self.env, self.frames, self.probabilities = env, frames, probabilities
+        self.steps, self.before, self.said = [], None, None
 
     def __getattr__(self, name):
         return getattr(self.env, name)
@@ -45,37 +61,101 @@ class Recorder:
 
     def reset(self, **options):
         obs, infos = self.env.reset(**options)
-        if self.free is None:
-            self._look(infos)
+        if self.before is None:
+            self._look(obs, infos)
         return obs, infos
 
     def step(self, actions):
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
-        if not self.over:
-            self.steps.append((self.free, infos["macro_action"][0], rewards[0], self.said))
-            self._look(infos)
-            self.over = bool(terminations[0] or truncations[0])
+        if not (self.steps and self.steps[-1].over[0]):
+            done = terminations[:1], (terminations | truncations)[:1]
+            before = *self.before, self.said, rewards[:1], *done
+            self.steps.append(Step(*before, *self._look(obs, infos)))
         return obs, rewards, terminations, truncations, infos
 
-    def _look(self, infos):
-        self.free = infos["macro_done"][0]
+    def _look(self, obs, infos):
+        self.before = obs[:1], {key: value[:1] for key, value in infos.items()}
         if self.frames is not None:
             self.frames.append(self.env._draw(0))  # render() would draw the whole batch
+        return self.before
 
-    def episode(self, probabilities=False):
-        """The Episode up to now, without utilities if one network speaks for the whole team.
-
-        probabilities: what the networks say are logits.
-        """
-        chosen, running, rewards, said = zip(*self.steps, strict=True)
-        utilities, meaning = None, "probability" if probabilities else "utility"
+    def episode(self):
+        """The timeline.Episode up to now, without utilities if one network speaks for the whole team."""
+        chosen = np.concatenate([step.infos["macro_done"] for step in self.steps])  # [T, n]
+        running = np.concatenate([step.next_infos["macro_action"] for step in self.steps])  # [T, n]
+        rewards = np.concatenate([step.rewards for step in self.steps])  # [T]
+        utilities, said = None, [step.said for step in self.steps]
         if all(one is not None and len(one) == self.n_agents for one in said):
             utilities = torch.stack(said)  # [T, n, A]
-            utilities = (utilities.softmax(2) if probabilities else utilities).numpy()
+            utilities = (utilities.softmax(2) if self.probabilities else utilities).numpy()
         robots = getattr(self.env, "n_robots", self.n_agents)  # the warehouse's last agent is the arm
         labels = [agent if agent < robots else rendering.ARM for agent in range(self.n_agents)]
-        arrays = np.array(chosen), np.array(running), np.array(rewards)
-        return timeline.Episode(labels, self.macro_action_names, *arrays, utilities, meaning)
+        meaning = "probability" if self.probabilities else "utility"
+        return timeline.Episode(labels, self.macro_action_names, chosen, running, rewards, utilities, meaning)
+
+
+def watch(script, args, learner, episodes, seed, frames=None):
+    """Plays greedily: the script's results, a dict of float64 [episodes], and the Recorder of the first.
+
+    frames: a list that receives its pictures, or None.
+    """
+    recorder = Recorder(envs.make(args.env, episodes), frames, probabilities="critics" in learner)
+    hook = learner["agents"].register_forward_hook(recorder.listen)
+    result = script.evaluate(learner["agents"], recorder, args.gamma, seed)
+    hook.remove()
+    return result, recorder
+
+
+# ---- its rows -------------------------------------------------------------------------------------------------------
+def remember(script, args, steps):
+    """The script's replay buffer after its training loop has put an episode of Steps into it, and nothing else."""
+    buffer = getattr(script, "ReplayBuffer", None) or script.EpisodeBuffer
+    buffer = buffer(envs.make(args.env), 1)
+    gamma = args.gamma if args.discount == "step" else 1.0
+    for step in steps:
+        state = [step.infos["state"]] if hasattr(buffer, "state") else []  # only mixers need it
+        buffer.add(step.obs, step.next_infos["macro_action"], step.infos["macro_done"], *state)
+        discounts = gamma * ~step.terminated
+        buffer.step(*state, args.reward_scale * step.rewards, discounts, step.over, step.next_obs, step.next_infos)
+    return buffer
+
+
+def describe_rows(script, args, recorder, first, last):
+    """Lines of at most COLUMNS characters: the rows from one number to another as the script's replay buffer holds
+    them (Fig. 2 of the paper), each with a line for every agent. The row after the last choice is the final one.
+
+    Raises:
+        ValueError: the episode has no such rows.
+    """
+    buffer, episode = remember(script, args, recorder.steps), recorder.episode()
+    times, place = [*episode.rows(), len(episode.rewards)], buffer.queue[-1]
+    if last >= len(times):
+        raise ValueError(f"the episode has rows 0 to {len(times) - 1}")
+    row_gamma = args.gamma if args.discount == "decision" else 1.0
+    wide = max(len(name) for names in episode.names for name in names)
+    lines = [
+        "since: the row at which the agent chose its macro-action; if it is an earlier one, the agent is ongoing here",
+        f"r: rewards until the next row, discounted and summed, times --reward-scale {args.reward_scale:g}",
+        f"discount: {'gamma^tau' if args.discount == 'step' else 'gamma'} of the next row's value, 0 at a terminal end",
+        "",
+        f"{'row':>4}{'t':>5}{'tau':>5}{'r':>10}{'discount':>10} | {'agent':6}{'runs':{wide + 2}}{'since':>5}"
+        f"  {'here':9}last saw",
+    ]
+    for row in range(first, last + 1):
+        final = row == len(times) - 1
+        tau = "end" if final else times[row + 1] - times[row]
+        reward, discount = buffer.reward[place, row], row_gamma * buffer.discount[place, row]
+        left = f"{row:4}{times[row]:5}{tau:>5}" + ("" if final else f"{reward:10.4f}{discount:10.4f}")
+        for agent, label in enumerate(episode.labels):
+            since, action = buffer.since[place, row, agent], buffer.action[place, row, agent]
+            name = "-" if final else episode.names[agent][action]
+            here = "free" if final else "chosen" if since == row else "ongoing"
+            saw = buffer.obs[place, row, agent, : recorder.obs_sizes[agent]]
+            saw = " ".join(f"{round(float(x), 2) + 0.0:g}" for x in saw)  # + 0.0: not -0
+            line = f"{left:34} | {label:<6}{name:{wide + 2}}{since:5}  {here:9}{saw}"
+            lines.append(line if len(line) <= COLUMNS else line[: COLUMNS - 4] + " ...")
+            left = ""
+    return lines
 
 
 # ---- the command line -----------------------------------------------------------------------------------------------
@@ -107,18 +187,6 @@ def load_run(folder, name):
     return script, args, learner, model["step"]
 
 
-def watch(script, args, learner, episodes, seed, frames=None):
-    """Plays greedily: the script's results, a dict of float64 [episodes], and the Episode of the first.
-
-    frames: a list that receives its pictures, or None.
-    """
-    recorder = Recorder(envs.make(args.env, episodes), frames)
-    hook = learner["agents"].register_forward_hook(recorder.listen)
-    result = script.evaluate(learner["agents"], recorder, args.gamma, seed)
-    hook.remove()
-    return result, recorder.episode(probabilities="critics" in learner)
-
-
 def write(path, picture, kind, **options):
     """Writes a picture beside the file and swaps, so that a failure leaves the file that was there."""
     new = Path(f"{path}.new")
@@ -128,6 +196,12 @@ def write(path, picture, kind, **options):
     except OSError as error:
         new.unlink(missing_ok=True)
         fail(f"cannot write {path}: {error.strerror or error}")
+
+
+def span(words):
+    """The two numbers of "A-B", or (1, 0) for anything else."""
+    ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", words)
+    return tuple(map(int, ends.groups())) if ends else (1, 0)
 
 
 def parse_args(argv=None):
@@ -140,6 +214,7 @@ def parse_args(argv=None):
     parser.add_argument("--seed", type=int, help="of the episodes, from 0 on (default: that of the run)")
     parser.add_argument("--gif", metavar="FILE", help="write an animation of the first episode")
     parser.add_argument("--timeline", metavar="FILE", help="write a picture of its macro-actions and rows, a PNG")
+    parser.add_argument("--rows", metavar="A-B", help="print its rows A to B as the replay buffer holds them")
     parser.add_argument("--steps", metavar="A-B", help="with --timeline: only time A to B, enlarged, with utilities")
     options = parser.parse_args(argv)
     if options.episodes < 1:
@@ -152,10 +227,13 @@ def parse_args(argv=None):
     if options.steps is not None:
         if not options.timeline:
             fail("--steps needs --timeline")
-        ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", options.steps)
-        options.steps = tuple(map(int, ends.groups())) if ends else (0, 0)
+        options.steps = span(options.steps)
         if options.steps[0] >= options.steps[1]:
             fail("--steps must be two times, the second after the first, such as 0-40")
+    if options.rows is not None:
+        options.rows = span(options.rows)
+        if options.rows[0] > options.rows[1]:
+            fail("--rows must be two rows, the second not before the first, such as 0-8")
     return options
 
 
@@ -165,14 +243,21 @@ def main(argv=None):
     torch.set_num_threads(1)  # fastest for networks of this size
     script, args, learner, step = load_run(options.run, options.model)
     seed, frames = args.seed if options.seed is None else options.seed, [] if options.gif else None
-    result, episode = watch(script, args, learner, options.episodes, seed, frames)
-    length, name = len(episode.rewards), f"{args.env} {script.__name__}"
+    result, recorder = watch(script, args, learner, options.episodes, seed, frames)
+    episode, name = recorder.episode(), f"{args.env} {script.__name__}"
+    length = len(episode.rewards)
     if options.steps and options.steps[1] > length:
         fail(f"--steps {options.steps[0]}-{options.steps[1]} is out of range: the episode has {length} steps")
+    try:
+        rows = describe_rows(script, args, recorder, *options.rows) if options.rows else []
+    except ValueError as error:
+        fail(f"--rows {options.rows[0]}-{options.rows[1]} is out of range: {error}")
     print(f"{name} {options.model} model of step {step}: {options.episodes} greedy episodes")
     for key, value in result.items():
         error = value.std(ddof=1) / len(value) ** 0.5 if len(value) > 1 else float("nan")
         print(f"{key.replace('_', ' '):17s} {value.mean():9.3f} +- {error:.3f} (standard error)")
+    if rows:
+        print("", *rows, sep="\n")
     if options.gif:
         pictures = [Image.fromarray(frame).quantize(dither=0) for frame in frames]
         times = [150] * (len(frames) - 1) + [1500]  # milliseconds

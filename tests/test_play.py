@@ -42,7 +42,7 @@ def brief(monkeypatch):
 
 def played(run, episodes=2, **options):
     script, args, learner, _ = play.load_run(run, "best")
-    return play.watch(script, args, learner, episodes, seed=5, **options)
+    return play.watch(script, args, learner, episodes, seed=5, **options)[1].episode()
 
 
 # ---- recording ------------------------------------------------------------------------------------------------------
@@ -93,7 +93,8 @@ def test_watching_gives_the_results_of_the_script_and_its_first_episode(run, bri
     script, args, learner, _ = play.load_run(run, "best")
     expected = script.evaluate(learner["agents"], envs.make(args.env, 4), args.gamma, 5)
     frames = []
-    result, episode = play.watch(script, args, learner, 4, 5, frames)
+    result, recorder = play.watch(script, args, learner, 4, 5, frames)
+    episode = recorder.episode()
     for key, value in expected.items():
         np.testing.assert_allclose(result[key], value)
     assert len(episode.rewards) == expected["length"][0] == len(frames) - 1
@@ -102,11 +103,100 @@ def test_watching_gives_the_results_of_the_script_and_its_first_episode(run, bri
 
 
 def test_agents_choose_what_their_networks_find_best(run):
-    _, episode = played(run)
+    episode = played(run)
     best = episode.utilities.argmax(2)
     assert len(set(best[episode.chosen].tolist())) > 1 and episode.meaning == "utility"
     np.testing.assert_array_equal(best[episode.chosen], episode.running[episode.chosen])
     assert np.isneginf(episode.utilities[:, 0, 3:]).all(), "a robot has three macro-actions"
+
+
+# ---- rows -----------------------------------------------------------------------------------------------------------
+def printed(lines):
+    """What describe_rows says: of each row what stands left of the bar, of each agent and row what stands right."""
+    halves = [line.split("|") for line in lines if "|" in line][1:]
+    return [left.split() for left, _ in halves if left.strip()], [right.split() for _, right in halves]
+
+
+def test_the_rows_of_a_scripted_episode_are_the_ones_done_by_hand():
+    """Every reward is -0.1, times 10: a row of two steps has -1 - 0.9."""
+    script, recorder = importlib.import_module("avf_qplex"), scripted()
+    args = script.Args(env="bp-10", gamma=0.9, reward_scale=10.0)
+    rows, agents = printed(play.describe_rows(script, args, recorder, 0, 7))
+    assert rows == [
+        ["0", "0", "1", "-1.0000", "0.9000"],
+        ["1", "1", "1", "-1.0000", "0.9000"],
+        ["2", "2", "2", "-1.9000", "0.8100"],
+        ["3", "4", "1", "-1.0000", "0.9000"],
+        ["4", "5", "1", "-1.0000", "0.9000"],
+        ["5", "6", "1", "-1.0000", "0.9000"],
+        ["6", "7", "1", "-1.0000", "0.9000"],  # cut off by the horizon, not terminal
+        ["7", "8", "end"],
+    ]
+    assert [agent[:4] for agent in agents[:8] + agents[-2:]] == [
+        ["0", "Stay", "0", "chosen"],
+        ["1", "Go-to-Small-Box(1)", "0", "chosen"],
+        ["0", "Stay", "1", "chosen"],
+        ["1", "Go-to-Small-Box(1)", "0", "ongoing"],
+        ["0", "Go-to-Small-Box(0)", "2", "chosen"],
+        ["1", "Go-to-Small-Box(1)", "0", "ongoing"],
+        ["0", "Go-to-Small-Box(0)", "2", "ongoing"],
+        ["1", "Turn-right", "3", "chosen"],
+        ["0", "-", "7", "free"],
+        ["1", "-", "7", "free"],
+    ]
+    assert printed(play.describe_rows(script, args, recorder, 2, 3)) == (rows[2:4], agents[4:8])
+    args = dataclasses.replace(args, discount="decision")
+    rows, _ = printed(play.describe_rows(script, args, recorder, 2, 2))
+    assert rows == [["2", "2", "2", "-2.0000", "0.9000"]], "gamma once a row"
+    recorder.steps[-1] = recorder.steps[-1]._replace(terminated=np.array([True]))
+    assert printed(play.describe_rows(script, args, recorder, 6, 6))[0] == [["6", "7", "1", "-1.0000", "0.0000"]]
+    with pytest.raises(ValueError, match="the episode has rows 0 to 7"):
+        play.describe_rows(script, args, recorder, 7, 8)
+
+
+def test_what_an_agent_last_saw_stays_until_it_chooses():
+    """Robot 0 waits for a tool, robot 1 is in the tool room from time 2 on, the arm has found tool 0 at time 6."""
+    script, recorder = importlib.import_module("avf_qplex"), play.Recorder(envs.make("wtd-s", horizon=7))
+    _, infos = recorder.reset(seed=0)
+    for _ in range(7):
+        _, _, _, _, infos = recorder.step(np.where(infos["macro_done"], [[2, 1, 3]], infos["macro_action"]))
+    rows, agents = printed(play.describe_rows(script, script.Args(), recorder, 0, 5))
+    assert [row[1] for row in rows] == ["0", "2", "3", "4", "5", "6"]
+    nowhere, room = "0 0 0 1 0 0 0 0 0 0 0 0 0".split(), "0 1 0 0 0 0 0 0 0 0 0 0 0".split()
+    assert (
+        agents[12:]
+        == [  # at time 5 and at time 6
+            ["0", "Get-Tool", "0", "ongoing", *nowhere],
+            ["1", "Go-TR", "4", "chosen", *room],
+            ["A", "Search-Tool(0)", "0", "ongoing", *"00000"],
+            ["0", "Get-Tool", "0", "ongoing", *nowhere],
+            ["1", "Go-TR", "5", "chosen", *room[:11], "1", "0"],
+            ["A", "Search-Tool(0)", "5", "chosen", *"10010"],
+        ]
+    )
+
+
+def test_what_is_printed_is_what_is_sampled_for_learning():
+    script, recorder = importlib.import_module("avf_qmix"), scripted()
+    args, rng = script.Args(env="bp-10"), np.random.default_rng(0)
+    batch = play.remember(script, args, recorder.steps).sample(1, 100, "joint", rng)
+    rows, agents = printed(play.describe_rows(script, args, recorder, 0, 7))
+    assert batch["valid"][0].tolist() == [True] * 7 + [False]
+    np.testing.assert_allclose(batch["reward"][0, :7], [float(row[3]) for row in rows[:7]], atol=6e-5)
+    np.testing.assert_allclose(batch["discount"][0, :7], [float(row[4]) for row in rows[:7]], atol=6e-5)
+    assert batch["chosen"][0, :7].flatten().tolist() == [agent[3] == "chosen" for agent in agents[:14]]
+    names = recorder.episode().names[0]
+    assert batch["action"][0, :7].flatten().tolist() == [names.index(agent[1]) for agent in agents[:14]]
+
+
+@pytest.mark.parametrize("env_id", ["bp-30", "wtd-t1", "ct-10"])
+def test_rows_fit_a_terminal(env_id):
+    script, recorder = importlib.import_module("avf_vdn"), play.Recorder(envs.make(env_id, horizon=30))
+    recorder.reset(seed=1)
+    for _ in range(30):
+        recorder.step(np.ones((1, recorder.n_agents), int))
+    lines = play.describe_rows(script, script.Args(env=env_id), recorder, 0, 3)
+    assert max(map(len, lines)) <= 120 and not any(line.endswith("...") for line in lines)
 
 
 # ---- the command line -----------------------------------------------------------------------------------------------
@@ -146,9 +236,11 @@ def test_the_files_that_are_written(run, tmp_path, brief, capsys):
 @pytest.mark.parametrize("name", play.SCRIPTS)
 def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
     folder = train(name, "bp-10", tmp_path, total_timesteps=600)
-    play.main([str(folder), "--episodes=2", f"--timeline={tmp_path / 'team.png'}", "--steps=0-3"])
-    assert f"bp-10 {name} best model" in capsys.readouterr().out and (tmp_path / "team.png").exists()
-    _, episode = played(folder, 1)
+    play.main([str(folder), "--episodes=2", f"--timeline={tmp_path / 'team.png'}", "--steps=0-3", "--rows=0-1"])
+    out = capsys.readouterr().out
+    assert f"bp-10 {name} best model" in out and printed(out.splitlines())[0][0][:2] == ["0", "0"]
+    assert (tmp_path / "team.png").exists()
+    episode = played(folder, 1)
     if name == "cen_maddrqn":
         assert episode.utilities is None
     else:
@@ -166,6 +258,9 @@ def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
         (["--seed=-1"], "--seed must not be negative, got -1"),
         (["--model=worst"], "invalid choice: 'worst'"),
         (["--render"], "unrecognized arguments: --render"),
+        (["--rows=4"], "--rows must be two rows, the second not before the first, such as 0-8"),
+        (["--rows=4-3"], "--rows must be two rows, the second not before the first, such as 0-8"),
+        (["--rows=0-99"], "--rows 0-99 is out of range: the episode has rows 0 to "),
         (["--steps=0-4"], "--steps needs --timeline"),
         (["--timeline={}/team.png", "--steps=4"], "--steps must be two times, the second after the first"),
         (["--timeline={}/team.png", "--steps=4-4"], "--steps must be two times, the second after the first"),
