@@ -81,8 +81,9 @@ def draw(episode, title, facts, steps=None):
     canvas.text(24, 30, title, 20, bold=True)
     canvas.text(24, 56, facts, 13, MUTED)
     canvas.text(24, 80, WORDS, 13)
-    _draw_legend(canvas.at(24, 106), f"the {best} of highest {episode.meaning}" if best else None)
-    row, key, pitch = example_row(episode, *spans[0]), {}, (WIDTH - LEFT - RIGHT) / length
+    _draw_legend(canvas.at(24, 106), episode, f"the {best} of highest {episode.meaning}" if best else None)
+    row, pitch = example_row(episode, *spans[0]), (WIDTH - LEFT - RIGHT) / length
+    key = {rendering.ARM: "the arm"} if rendering.ARM in episode.labels else {}
     _draw_example(canvas.at(0, 126), episode, row, spans[0], pitch)
     for number, span in enumerate(spans):
         _Strip(canvas.at(LEFT, HEAD + height * number), episode, *span, pitch, lane, best, row, key).draw()
@@ -91,17 +92,23 @@ def draw(episode, title, facts, steps=None):
     return canvas.pixels()
 
 
-def _draw_legend(canvas, utilities):
+def _draw_legend(canvas, episode, utilities):
+    """What the marks mean. The example of a macro-action is the longest one of agent 0 with its shortest name."""
+    bars = [(episode.names[0][action], start, end - start) for start, end, action in episode.bars(0)]
+    name, start, steps = min(bars, key=lambda bar: (len(bar[0]), -bar[2]))
+    name = name if len(name) < 12 else shorten(name)
     _draw_dot(canvas, 6, 0)
     x = _draw_words(canvas, 17, 0, "an agent chooses") + 22
     canvas.box(x, -9, 1, 18, RULE)
     x = _draw_words(canvas, x + 8, 0, "row: a time at which at least one agent chooses") + 22
-    canvas.box(x, -9, 58, 18, rendering.AGENTS[0][0], radius=3)
-    canvas.text(x + 8, 0, "Stay · 3", 12, WHITE)
-    x = _draw_words(canvas, x + 66, 0, "macro-action and its steps") + 22
+    words = f"{name} · {steps}"
+    canvas.box(x, -9, canvas.width(words, 12) + 16, 18, rendering.AGENTS[0][0], radius=3)
+    canvas.text(x + 8, 0, words, 12, WHITE)
+    x = _draw_words(canvas, x + canvas.width(words, 12) + 24, 0, "macro-action and its steps") + 22
     if utilities:
-        canvas.text(x, 0, "Stay  9.5", 10)
-        _draw_words(canvas, x + 48, 0, utilities)
+        words = f"{name}  {episode.utilities[start, 0].max():.2f}"
+        canvas.text(x, 0, words, 10)
+        _draw_words(canvas, x + canvas.width(words, 10) + 8, 0, utilities)
 
 
 def _draw_example(canvas, episode, row, span, pitch):

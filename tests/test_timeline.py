@@ -51,6 +51,7 @@ def test_a_dot_and_a_name_for_each_macro_action_and_a_number_for_each_row(episod
     for agent, lane in enumerate(lanes):
         times = [(x / 4 - timeline.LEFT) / pitch for x, y in dots if y == lane]
         np.testing.assert_allclose(times, [start for start, _, _ in episode.bars(agent)], atol=1e-6)
+    assert words.count("Stay · 1") == 1 + 5, "one in the legend"
     for name in ("Go-to-Small-Box(0) · 4", "Go-to-Small-Box(1) · 4", "Turn-left · 1", "Turn-right · 1"):
         assert name in words
     start = words.index("row")
@@ -117,6 +118,7 @@ def test_no_text_covers_another_or_leaves_the_picture(env_id, steps, spy):
     apart = (left[:, None] >= right) | (left >= right[:, None]) | (top[:, None] >= bottom) | (top >= bottom[:, None])
     covered = [(texts[one][0], texts[other][0]) for one, other in np.argwhere(~apart) if one < other]
     assert not covered
+    assert ("A: the arm" in texts[-1][0]) == env_id.startswith("wtd")
 
 
 def test_the_colours_are_those_of_the_rendering(episode):
@@ -146,5 +148,6 @@ def test_names_without_room_are_shortened_or_put_below_and_explained(episode, sp
     timeline.draw(episode, "title", "facts")
     words = said(texts)
     assert "Push x50" in words and "Push x9" in words and "Push x35" in words
-    assert not {"Push · 1", "Go-to-Small-Box(0) · 3", "Turn-right · 3"} & set(words)
+    assert words.count("Push · 1") == 1, "in the legend"
+    assert not {"Go-to-Small-Box(0) · 3", "Turn-right · 3"} & set(words)
     assert "GtSB(0)" in words and "Tr" in words and words[-1] == "GtSB: Go-to-Small-Box · Tr: Turn-right"
