@@ -1,10 +1,11 @@
-"""Watches what a script has saved: figures of merit, an animation and a timeline of macro-actions.
+"""Watches what a script has saved: figures of merit, an animation, a timeline of macro-actions, rows for learning.
 
     python play.py runs/<folder> --gif team.gif --timeline team.png
+    python play.py runs/<folder> --rows 0-8
 
-The model plays --episodes greedy episodes side by side, of which means and standard errors are printed. The animation
-and the timeline show the first of them, that of environment 0 (so, where a task has chance, another one for another
---episodes).
+The model plays --episodes greedy episodes side by side, of which means and standard errors are printed. Animation,
+timeline and rows are those of the first of them, that of environment 0 (so, where a task has chance, of another one for
+another --episodes).
 """
 
 import argparse
@@ -12,8 +13,6 @@ import importlib
 import json
 import os
 import re
-from dataclasses import dataclass
-from math import ceil
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,44 +21,36 @@ import torch
 from PIL import Image
 
 import envs
+import timeline
 from envs import rendering
-from envs.rendering import ALARM, GREEN_DARK, INK, MUTED, PAPER, WHITE, Canvas
 
 SCRIPTS = ("avf_vdn", "avf_qmix", "avf_qplex", "dec_maddrqn", "cen_maddrqn", "mac_iaicc")
+COLUMNS = 120  # of the terminal in which rows are printed
 
 
 # ---- watching an episode --------------------------------------------------------------------------------------------
-class Episode(NamedTuple):
-    """T steps of n agents. Step t leads from time t to time t + 1; macro-actions start and end at times."""
+class Step(NamedTuple):
+    """A step of environment 0 and what stands before and after it, arrays [1, ...] as of a batch of one."""
 
-    labels: list  # [n], what the agents' discs say
-    names: list  # [n][A], the names of the macro-actions
-    chosen: np.ndarray  # bool [T, n], the agent started a macro-action at time t
-    running: np.ndarray  # int64 [T, n], its macro-action in step t
-    rewards: np.ndarray  # float64 [T]
-    utilities: np.ndarray | None  # float32 [T, n, A], what its network said at time t, -inf for padding
-    meaning: str  # of the utilities: "utility" or "probability"
-
-    def rows(self):
-        """The decision rows: times at which at least one agent started a macro-action."""
-        return np.flatnonzero(self.chosen.any(1)).tolist()
-
-    def bars(self, agent):
-        """The agent's macro-actions in their order, (start, end, macro-action) each."""
-        starts = np.flatnonzero(self.chosen[:, agent]).tolist()
-        ends = [*starts[1:], len(self.chosen)]
-        return list(zip(starts, ends, self.running[starts, agent].tolist(), strict=True))
+    obs: np.ndarray
+    infos: dict
+    said: torch.Tensor | None  # float32 [n, A], what the agents' networks said before it
+    rewards: np.ndarray
+    terminated: np.ndarray
+    over: np.ndarray  # terminated or truncated
+    next_obs: np.ndarray
+    next_infos: dict
 
 
 class Recorder:
     """Behaves as the batch of environments it is given and records the first episode of environment 0.
 
-    frames: a list that receives its pictures, or None.
+    frames: a list that receives its pictures, or None. probabilities: what the networks say are logits.
     """
 
-    def __init__(self, env, frames=None):
-        self.env, self.frames = env, frames
-        self.steps, self.free, self.said, self.over = [], None, None, False
+    def __init__(self, env, frames=None, probabilities=False):
+        self.env, self.frames, self.probabilities = env, frames, probabilities
+        self.steps, self.before, self.said = [], None, None
 
     def __getattr__(self, name):
         return getattr(self.env, name)
@@ -70,319 +61,101 @@ class Recorder:
 
     def reset(self, **options):
         obs, infos = self.env.reset(**options)
-        if self.free is None:
-            self._look(infos)
+        if self.before is None:
+            self._look(obs, infos)
         return obs, infos
 
     def step(self, actions):
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
-        if not self.over:
-            self.steps.append((self.free, infos["macro_action"][0], rewards[0], self.said))
-            self._look(infos)
-            self.over = bool(terminations[0] or truncations[0])
+        if not (self.steps and self.steps[-1].over[0]):
+            done = terminations[:1], (terminations | truncations)[:1]
+            before = *self.before, self.said, rewards[:1], *done
+            self.steps.append(Step(*before, *self._look(obs, infos)))
         return obs, rewards, terminations, truncations, infos
 
-    def _look(self, infos):
-        self.free = infos["macro_done"][0]
+    def _look(self, obs, infos):
+        self.before = obs[:1], {key: value[:1] for key, value in infos.items()}
         if self.frames is not None:
             self.frames.append(self.env._draw(0))  # render() would draw the whole batch
+        return self.before
 
-    def episode(self, probabilities=False):
-        """The Episode up to now, without utilities if one network speaks for the whole team.
-
-        probabilities: what the networks say are logits.
-        """
-        chosen, running, rewards, said = zip(*self.steps, strict=True)
-        utilities, meaning = None, "probability" if probabilities else "utility"
+    def episode(self):
+        """The timeline.Episode up to now, without utilities if one network speaks for the whole team."""
+        chosen = np.concatenate([step.infos["macro_done"] for step in self.steps])  # [T, n]
+        running = np.concatenate([step.next_infos["macro_action"] for step in self.steps])  # [T, n]
+        rewards = np.concatenate([step.rewards for step in self.steps])  # [T]
+        utilities, said = None, [step.said for step in self.steps]
         if all(one is not None and len(one) == self.n_agents for one in said):
             utilities = torch.stack(said)  # [T, n, A]
-            utilities = (utilities.softmax(2) if probabilities else utilities).numpy()
+            utilities = (utilities.softmax(2) if self.probabilities else utilities).numpy()
         robots = getattr(self.env, "n_robots", self.n_agents)  # the warehouse's last agent is the arm
         labels = [agent if agent < robots else rendering.ARM for agent in range(self.n_agents)]
-        arrays = np.array(chosen), np.array(running), np.array(rewards)
-        return Episode(labels, self.macro_action_names, *arrays, utilities, meaning)
+        meaning = "probability" if self.probabilities else "utility"
+        return timeline.Episode(labels, self.macro_action_names, chosen, running, rewards, utilities, meaning)
 
 
-# ---- the timeline ---------------------------------------------------------------------------------------------------
-WIDTH, LEFT, RIGHT = 1000, 92, 56  # the picture and its margins, in pixels before the picture is doubled
-HEAD, LANES, FOOT = 206, 26, 124  # heights above the first strip, in a strip above its lanes and below them
-BAR, LANE = 22, 38  # heights of a bar and of its lane, which is higher where it has utilities below the bar
-RULE = "#aab5bf"
-WORDS = "Asynchronous: macro-actions end at different times, so at a row some agents choose and the others go on."
+def watch(script, args, learner, episodes, seed, frames=None):
+    """Plays greedily: the script's results, a dict of float64 [episodes], and the Recorder of the first.
 
-
-def shorten(name):
-    """A macro-action's initials and arguments, or two letters: Pass-to-M(0) is PtM(0), Go-TR is GTR, Stay is St."""
-    stem, bracket, arguments = name.partition("(")
-    words = stem.split("-")
-    initials = "".join(word if word.isupper() else word[0] for word in words)
-    return (initials if len(words) > 1 else stem[:2]) + bracket + arguments
-
-
-def example_row(episode, first, last):
-    """The row between two times that shows best what ongoing means, or None: one at which an agent is ongoing.
-
-    Better are two ongoing ones, and other rows at a distance of three steps.
+    frames: a list that receives its pictures, or None.
     """
-    rows, scores = episode.rows(), {}
-    for before, row, after in zip([first, *rows], rows, [*rows[1:], last], strict=False):
-        if first < row < last and not episode.chosen[row].all():
-            ongoing = np.count_nonzero(~episode.chosen[row])
-            scores[row] = min(ongoing, 2), min(row - before, after - row, last - row, 3), -row
-    return max(scores, key=scores.get, default=None)
+    recorder = Recorder(envs.make(args.env, episodes), frames, probabilities="critics" in learner)
+    hook = learner["agents"].register_forward_hook(recorder.listen)
+    result = script.evaluate(learner["agents"], recorder, args.gamma, seed)
+    hook.remove()
+    return result, recorder
 
 
-def draw_timeline(episode, title, facts, steps=None):
-    """The timeline of an episode: a lane for each agent, a line for each decision row, rewards and return.
+# ---- its rows -------------------------------------------------------------------------------------------------------
+def remember(script, args, steps):
+    """The script's replay buffer after its training loop has put an episode of Steps into it, and nothing else."""
+    buffer = getattr(script, "ReplayBuffer", None) or script.EpisodeBuffer
+    buffer = buffer(envs.make(args.env), 1)
+    gamma = args.gamma if args.discount == "step" else 1.0
+    for step in steps:
+        state = [step.infos["state"]] if hasattr(buffer, "state") else []  # only mixers need it
+        buffer.add(step.obs, step.next_infos["macro_action"], step.infos["macro_done"], *state)
+        discounts = gamma * ~step.terminated
+        buffer.step(*state, args.reward_scale * step.rewards, discounts, step.over, step.next_obs, step.next_infos)
+    return buffer
 
-    title, facts: its first lines. steps: None for the whole episode, or (first, last) for the part between two times,
-    enlarged, with what the agents' networks said.
 
-    Returns uint8 [height, width, 3].
+def describe_rows(script, args, recorder, first, last):
+    """Lines of at most COLUMNS characters: the rows from one number to another as the script's replay buffer holds
+    them (Fig. 2 of the paper), each with a line for every agent. The row after the last choice is the final one.
+
+    Raises:
+        ValueError: the episode has no such rows.
     """
-    first, last = steps or (0, len(episode.rewards))
-    length = ceil((last - first) / ceil((last - first) / (12 if steps else 50)))  # steps in a strip
-    spans = [(start, min(start + length, last)) for start in range(first, last, length)]
-    best = min(3, max(map(len, episode.names))) if steps and episode.utilities is not None else 0
-    lane = BAR + 10 + 12 * best if best else LANE
-    height = LANES + lane * len(episode.labels) + FOOT
-    canvas = Canvas(2 * WIDTH, 2 * (HEAD + height * len(spans) + 14)).at(0, 0, 2)
-    canvas.text(24, 30, title, 20, bold=True)
-    canvas.text(24, 56, facts, 13, MUTED)
-    canvas.text(24, 80, WORDS, 13)
-    _draw_legend(canvas.at(24, 106), f"the {best} of highest {episode.meaning}" if best else None)
-    row, key, pitch = example_row(episode, *spans[0]), {}, (WIDTH - LEFT - RIGHT) / length
-    _draw_example(canvas.at(0, 126), episode, row, spans[0], pitch)
-    for number, span in enumerate(spans):
-        _Strip(canvas.at(LEFT, HEAD + height * number), episode, *span, pitch, lane, best, row, key).draw()
-    words = " · ".join(f"{short}: {name}" for short, name in sorted(key.items()))
-    canvas.text(24, HEAD + height * len(spans) - 6, words, 11, MUTED)
-    return canvas.pixels()
-
-
-def _draw_legend(canvas, utilities):
-    _draw_dot(canvas, 6, 0)
-    x = _draw_words(canvas, 17, 0, "an agent chooses") + 22
-    canvas.box(x, -9, 1, 18, RULE)
-    x = _draw_words(canvas, x + 8, 0, "row: a time at which at least one agent chooses") + 22
-    canvas.box(x, -9, 58, 18, rendering.AGENTS[0][0], radius=3)
-    canvas.text(x + 8, 0, "Stay · 3", 12, WHITE)
-    x = _draw_words(canvas, x + 66, 0, "macro-action and its steps") + 22
-    if utilities:
-        canvas.text(x, 0, "Stay  9.5", 10)
-        _draw_words(canvas, x + 48, 0, utilities)
-
-
-def _draw_example(canvas, episode, row, span, pitch):
-    """A box that explains one row of the first strip."""
-    canvas.box(24, 0, WIDTH - 48, 52, WHITE, INK, 1, 6)
-    if row is None:
-        canvas.text(40, 26, f"Up to t = {span[1]} all agents choose at every row: nobody is ongoing.", 12)
-        return
-    x = LEFT + pitch * (row - span[0])
-    canvas.polygon([(x - 7, 51), (x, 62), (x + 7, 51)], WHITE, INK)
-    canvas.box(x - 5.5, 48, 11, 3.5, WHITE)
-    canvas.text(40, 26, f"row {episode.rows().index(row)}, t = {row}", 13, bold=True)
-    _draw_dot(canvas, 172, 15)
-    _draw_tag(canvas, 172, 37)
-    running = [names[action] for names, action in zip(episode.names, episode.running[row], strict=True)]
-    agents, chosen = list(zip(episode.labels, running, strict=True)), episode.chosen[row]
-    _draw_words(canvas, 190, 15, "chosen now:", *(agents[agent] for agent in np.flatnonzero(chosen)))
-    words = "running macro-actions of the ongoing agents, which have no dot:"
-    _draw_words(canvas, 190, 37, words, *(agents[agent] for agent in np.flatnonzero(~chosen)))
-
-
-def _draw_words(canvas, x, y, words, *agents):
-    """Words and agents, (label, macro-action) each, one after the other; returns where they end."""
-    canvas.text(x, y, words, 12)
-    x += canvas.width(words, 12) + 8
-    for number, (label, name) in enumerate(agents):
-        end = x + 20 + canvas.width(name, 12)
-        if end > WIDTH - (40 if number == len(agents) - 1 else 110):
-            canvas.text(x, y, f"and {len(agents) - number} more", 12)
-            break
-        rendering._agent(canvas, x + 8, y, 8, label)
-        canvas.text(x + 20, y, name, 12)
-        x = end + 8
-    return x
-
-
-def _draw_dot(canvas, x, y):
-    canvas.disc(x, y, 5.7, WHITE)
-    canvas.disc(x, y, 4.5, INK)
-
-
-def _draw_tag(canvas, x, y):
-    """The mark of an ongoing agent: m with a raised minus, which the font does not have."""
-    canvas.box(x - 12, y - 8, 24, 16, WHITE, INK, 1, 8)
-    canvas.text(x - 8, y, "m", 12, bold=True)
-    canvas.box(x + 3, y - 4.3, 5, 1.2, INK)
-
-
-def _fit(canvas, size, rooms, *candidates):
-    """The first of the candidates that fits into one of the rooms, (left, right) each, and where it begins."""
-    for words in candidates:
-        for left, right in rooms:
-            if canvas.width(words, size) <= right - left:
-                return words, left
-    return "", 0
-
-
-@dataclass
-class _Strip:
-    """The part of a timeline between two times, as wide as the picture; its canvas begins at the first one."""
-
-    canvas: Canvas
-    episode: Episode
-    first: int
-    last: int
-    pitch: float  # pixels of a step
-    lane: int  # height of a lane
-    best: int  # how many utilities are shown
-    example: int | None  # the marked row
-    key: dict  # what abbreviations stand for; collected
-
-    def x(self, time):
-        """Where a time is; one outside the strip is put to its end."""
-        return (min(max(time, self.first), self.last) - self.first) * self.pitch
-
-    def draw(self):
-        bottom = LANES + self.lane * len(self.episode.labels)
-        for agent, label in enumerate(self.episode.labels):
-            top = LANES + self.lane * agent
-            self.canvas.box(0, top + 2, self.x(self.last), self.lane - 4, WHITE, radius=4)
-            rendering._agent(self.canvas, -26, top + 4 + BAR / 2, 11, label)
-        self.draw_rows(bottom + 86)
-        for agent in range(len(self.episode.labels)):
-            self.draw_lane(self.canvas.at(0, LANES + self.lane * agent + 4), agent)
-        self.draw_rewards(self.canvas.at(0, bottom))
-        self.draw_return(self.canvas.at(0, bottom + 48))
-        self.draw_time(self.canvas.at(0, bottom + 86))
-
-    def draw_rows(self, bottom):
-        self.canvas.text(-16, 12, "row", 12, MUTED, "r")
-        free = -10  # where there is room for the next number
-        for number, row in enumerate(self.episode.rows()):
-            if self.first <= row < self.last:
-                x, half, marked = self.x(row), self.canvas.width(number, 11) / 2, row == self.example
-                self.draw_line(self.canvas, row, 20, bottom, RULE)
-                if marked:
-                    self.canvas.box(x - 11, 4, 22, 16, INK, radius=8)
-                if x - half > free or marked:
-                    self.canvas.text(x, 12, number, 11, WHITE if marked else MUTED, "m")
-                    free = x + half + 3
-        if self.last == len(self.episode.rewards):
-            self.canvas.text(max(self.x(self.last), free + 12), 12, "end", 11, MUTED, "m")
-
-    def draw_line(self, canvas, row, top, bottom, colour):
-        width, colour = (1.8, INK) if row == self.example else (1, colour)
-        canvas.box(self.x(row) - width / 2, top, width, bottom - top, colour)
-
-    def draw_lane(self, canvas, agent):
-        fill, ink = rendering._colours(self.episode.labels[agent])
-        bars = [bar for bar in self.episode.bars(agent) if bar[0] < self.last and bar[1] > self.first]
-        unnamed = []  # runs of bars too short for their name: [start, end, name, how many]
-        for start, end, action in bars:
-            name, left, right = self.episode.names[agent][action], self.x(start), self.x(end) - 1.5
-            left -= 8 * (start < self.first)  # one that is cut sticks out
-            right += 9.5 * (end > self.last)
-            canvas.box(left, 0, right - left, BAR, fill, radius=3)
-            rooms = [(left + 8, right - 6)]
-            for row in self.episode.rows():
-                if max(start, self.first - 1) < row < min(end, self.last):
-                    self.draw_line(canvas, row, 0, BAR, RULE if ink == WHITE else MUTED)
-                    if row == self.example:
-                        _draw_tag(canvas, self.x(row), BAR / 2)
-                        rooms = [(left + 8, self.x(row) - 13), (self.x(row) + 14, right - 6)]
-            whole = ("... " if start < self.first else "") + name
-            words, at = _fit(canvas, 12, rooms, f"{whole} · {end - start}", whole, shorten(name))
-            if words:
-                canvas.box(at - 1, 4, canvas.width(words, 12) + 2, BAR - 8, fill)  # no line through the words
-                self.draw_name(canvas, at, BAR / 2, words, name, 12, ink)
-            elif unnamed and unnamed[-1][1:3] == [start, name]:
-                unnamed[-1][1], unnamed[-1][3] = end, unnamed[-1][3] + 1
-            else:
-                unnamed.append([start, end, name, 1])
-        for start, end, _ in bars:
-            if start >= self.first:
-                _draw_dot(canvas, self.x(start), BAR / 2)
-                if self.best:
-                    part = canvas.at(self.x(start) + 4, BAR + 8)
-                    self.draw_utilities(part, agent, start, self.x(end) - self.x(start) - 8)
-        for start, end, name, count in () if self.best else unnamed:
-            self.draw_names(canvas.at(0, BAR + 6), self.x(start), self.x(end) - 1.5, name, count)
-
-    def draw_name(self, canvas, x, y, words, name, size, ink):
-        """Words that stand for a name; an abbreviation goes into the key."""
-        canvas.text(x, y, words, size, ink)
-        if words and name not in words:
-            self.key[shorten(name).partition("(")[0]] = name.partition("(")[0]
-
-    def draw_names(self, canvas, left, right, name, count):
-        """The name of bars that have no room for it, below them; of several with a bracket."""
-        times = f" x{count}" if count > 1 else ""
-        words, _ = _fit(canvas, 10, [(left - 2, right)], name + times, shorten(name) + times, shorten(name))
-        if words and count > 1:
-            canvas.box(left, 0, right - left, 1, INK)
-            canvas.box(left, -4, 1, 5, INK)
-            canvas.box(right, -4, 1, 5, INK)
-        if words:
-            width = canvas.width(words, 10)
-            start = (left + right - width) / 2
-            canvas.box(start - 3, -4, width + 6, 11, WHITE)
-            self.draw_name(canvas, start, 2, words, name, 10, INK)
-
-    def draw_utilities(self, canvas, agent, time, room):
-        """The best macro-actions and their utilities, or as much of that as there is room for."""
-        said, names = self.episode.utilities[time, agent], self.episode.names[agent]
-        best = np.argsort(-said[: len(names)], kind="stable")[: self.best]
-        digits = 1 if np.abs(said[: len(names)]).max() >= 10 else 2
-        values = [f"{round(float(said[action]), digits) + 0.0:.{digits}f}" for action in best]  # + 0.0: not -0.0
-        full = [names[action] for action in best]
-        for words in (full, [shorten(name) for name in full], [""] * len(best)):
-            width = max(canvas.width(f"{word}  {value}", 10) for word, value in zip(words, values, strict=True))
-            if width <= room:
-                break
-        canvas.box(-1, -6, width + 2, 12 * len(best) - 1, WHITE)
-        for line, (word, value, name) in enumerate(zip(words, values, full, strict=True)):
-            ink = MUTED if line else INK
-            self.draw_name(canvas, 0, 12 * line, word, name, 10, ink)
-            canvas.text(width, 12 * line, value, 10, ink, "r")
-
-    def draw_rewards(self, canvas):
-        """A mark for each reward that is not 0, with a number where it is not the usual one."""
-        values, counts = np.unique(self.episode.rewards, return_counts=True)
-        usual, largest, free = values[counts.argmax()], np.abs(values).max(), 0
-        canvas.text(-16, 22, "reward", 12, MUTED, "r")
-        canvas.text(-16, 36, f"mostly {usual:+.4g}" if usual else "", 10, MUTED, "r")
-        canvas.box(0, 24, self.x(self.last), 1, RULE)
-        for step in range(self.first, self.last):
-            reward, x, words = self.episode.rewards[step], self.x(step + 0.5), f"{self.episode.rewards[step]:+.4g}"
-            colour, place = (GREEN_DARK, 14) if reward > 0 else (ALARM, 35)
-            if reward:
-                height = 2 + 14 * abs(reward) / largest
-                canvas.box(x - 1.5, 24 - height if reward > 0 else 25, 3, height, colour)
-            if reward not in (0, usual) and x > free:
-                canvas.box(x + 3, place - 6, canvas.width(words, 11) + 2, 12, PAPER)
-                canvas.text(x + 4, place, words, 11, colour)
-                free = x + 6 + canvas.width(words, 11)
-
-    def draw_return(self, canvas):
-        total = np.append(0.0, self.episode.rewards.cumsum())
-        heights = 28 - 28 * (total - total.min()) / max(np.ptp(total), 1e-9)
-        canvas.text(-16, 14, "return so far", 12, MUTED, "r")
-        canvas.line([(self.x(time), heights[time]) for time in range(self.first, self.last + 1)], INK, 1.5)
-        canvas.disc(self.x(self.last), heights[self.last], 3, INK)
-        canvas.text(self.x(self.last) + 8, heights[self.last], f"{total[self.last]:.4g}", 12, bold=True)
-
-    def draw_time(self, canvas):
-        canvas.text(-16, 13, "time t", 12, MUTED, "r")
-        canvas.box(0, 0, self.x(self.last), 1, MUTED)
-        every = 1 if self.pitch >= 24 else 5
-        for time in range(self.first, self.last + 1):
-            labelled = time % every == 0
-            canvas.box(self.x(time) - 0.5, 0, 1, 6 if labelled else 3, MUTED)
-            canvas.text(self.x(time), 13, time if labelled else "", 11, MUTED, "m")
+    buffer, episode = remember(script, args, recorder.steps), recorder.episode()
+    times, place = [*episode.rows(), len(episode.rewards)], buffer.queue[-1]
+    if last >= len(times):
+        raise ValueError(f"the episode has rows 0 to {len(times) - 1}")
+    row_gamma = args.gamma if args.discount == "decision" else 1.0
+    wide = max(len(name) for names in episode.names for name in names)
+    lines = [
+        "since: the row at which the agent chose its macro-action; if it is an earlier one, the agent is ongoing here",
+        f"r: rewards until the next row, discounted and summed, times --reward-scale {args.reward_scale:g}",
+        f"discount: {'gamma^tau' if args.discount == 'step' else 'gamma'} of the next row's value, 0 at a terminal end",
+        "",
+        f"{'row':>4}{'t':>5}{'tau':>5}{'r':>10}{'discount':>10} | {'agent':6}{'runs':{wide + 2}}{'since':>5}"
+        f"  {'here':9}last saw",
+    ]
+    for row in range(first, last + 1):
+        final = row == len(times) - 1
+        tau = "end" if final else times[row + 1] - times[row]
+        reward, discount = buffer.reward[place, row], row_gamma * buffer.discount[place, row]
+        left = f"{row:4}{times[row]:5}{tau:>5}" + ("" if final else f"{reward:10.4f}{discount:10.4f}")
+        for agent, label in enumerate(episode.labels):
+            since, action = buffer.since[place, row, agent], buffer.action[place, row, agent]
+            name = "-" if final else episode.names[agent][action]
+            here = "free" if final else "chosen" if since == row else "ongoing"
+            saw = buffer.obs[place, row, agent, : recorder.obs_sizes[agent]]
+            saw = " ".join(f"{round(float(x), 2) + 0.0:g}" for x in saw)  # + 0.0: not -0
+            line = f"{left:34} | {label:<6}{name:{wide + 2}}{since:5}  {here:9}{saw}"
+            lines.append(line if len(line) <= COLUMNS else line[: COLUMNS - 4] + " ...")
+            left = ""
+    return lines
 
 
 # ---- the command line -----------------------------------------------------------------------------------------------
@@ -414,18 +187,6 @@ def load_run(folder, name):
     return script, args, learner, model["step"]
 
 
-def watch(script, args, learner, episodes, seed, frames=None):
-    """Plays greedily: the script's results, a dict of float64 [episodes], and the Episode of the first.
-
-    frames: a list that receives its pictures, or None.
-    """
-    recorder = Recorder(envs.make(args.env, episodes), frames)
-    hook = learner["agents"].register_forward_hook(recorder.listen)
-    result = script.evaluate(learner["agents"], recorder, args.gamma, seed)
-    hook.remove()
-    return result, recorder.episode(probabilities="critics" in learner)
-
-
 def write(path, picture, kind, **options):
     """Writes a picture beside the file and swaps, so that a failure leaves the file that was there."""
     new = Path(f"{path}.new")
@@ -435,6 +196,12 @@ def write(path, picture, kind, **options):
     except OSError as error:
         new.unlink(missing_ok=True)
         fail(f"cannot write {path}: {error.strerror or error}")
+
+
+def span(words):
+    """The two numbers of "A-B", or (1, 0) for anything else."""
+    ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", words)
+    return tuple(map(int, ends.groups())) if ends else (1, 0)
 
 
 def parse_args(argv=None):
@@ -447,6 +214,7 @@ def parse_args(argv=None):
     parser.add_argument("--seed", type=int, help="of the episodes, from 0 on (default: that of the run)")
     parser.add_argument("--gif", metavar="FILE", help="write an animation of the first episode")
     parser.add_argument("--timeline", metavar="FILE", help="write a picture of its macro-actions and rows, a PNG")
+    parser.add_argument("--rows", metavar="A-B", help="print its rows A to B as the replay buffer holds them")
     parser.add_argument("--steps", metavar="A-B", help="with --timeline: only time A to B, enlarged, with utilities")
     options = parser.parse_args(argv)
     if options.episodes < 1:
@@ -459,10 +227,13 @@ def parse_args(argv=None):
     if options.steps is not None:
         if not options.timeline:
             fail("--steps needs --timeline")
-        ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", options.steps)
-        options.steps = tuple(map(int, ends.groups())) if ends else (0, 0)
+        options.steps = span(options.steps)
         if options.steps[0] >= options.steps[1]:
             fail("--steps must be two times, the second after the first, such as 0-40")
+    if options.rows is not None:
+        options.rows = span(options.rows)
+        if options.rows[0] > options.rows[1]:
+            fail("--rows must be two rows, the second not before the first, such as 0-8")
     return options
 
 
@@ -472,14 +243,21 @@ def main(argv=None):
     torch.set_num_threads(1)  # fastest for networks of this size
     script, args, learner, step = load_run(options.run, options.model)
     seed, frames = args.seed if options.seed is None else options.seed, [] if options.gif else None
-    result, episode = watch(script, args, learner, options.episodes, seed, frames)
-    length, name = len(episode.rewards), f"{args.env} {script.__name__}"
+    result, recorder = watch(script, args, learner, options.episodes, seed, frames)
+    episode, name = recorder.episode(), f"{args.env} {script.__name__}"
+    length = len(episode.rewards)
     if options.steps and options.steps[1] > length:
         fail(f"--steps {options.steps[0]}-{options.steps[1]} is out of range: the episode has {length} steps")
+    try:
+        rows = describe_rows(script, args, recorder, *options.rows) if options.rows else []
+    except ValueError as error:
+        fail(f"--rows {options.rows[0]}-{options.rows[1]} is out of range: {error}")
     print(f"{name} {options.model} model of step {step}: {options.episodes} greedy episodes")
     for key, value in result.items():
         error = value.std(ddof=1) / len(value) ** 0.5 if len(value) > 1 else float("nan")
         print(f"{key.replace('_', ' '):17s} {value.mean():9.3f} +- {error:.3f} (standard error)")
+    if rows:
+        print("", *rows, sep="\n")
     if options.gif:
         pictures = [Image.fromarray(frame).quantize(dither=0) for frame in frames]
         times = [150] * (len(frames) - 1) + [1500]  # milliseconds
@@ -487,7 +265,7 @@ def main(argv=None):
     if options.timeline:
         facts = f"A greedy episode of {length} steps, {len(episode.rows())} of them rows: "
         facts += f"return {result['return'][0]:.4g}{', success' * bool(result['success'][0])}"
-        picture = Image.fromarray(draw_timeline(episode, name.replace(" ", ", "), facts, options.steps))
+        picture = Image.fromarray(timeline.draw(episode, name.replace(" ", ", "), facts, options.steps))
         write(options.timeline, picture.quantize(256, Image.Quantize.MAXCOVERAGE), "PNG", optimize=True)
 
 

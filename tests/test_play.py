@@ -1,4 +1,4 @@
-"""play.py: what it records is what the environment did, what it prints is right, and its pictures can be read."""
+"""play.py: what it records is what the environment did, what it prints is right, and its files are whole."""
 
 import dataclasses
 import importlib
@@ -13,7 +13,8 @@ from PIL import Image
 
 import envs
 import play
-from envs.rendering import AGENTS, Canvas
+import timeline
+from tests.recording import scripted
 
 TINY = dict(num_envs=4, total_timesteps=1_200, learning_starts=200, train_frequency=20, batch_size=8, window=6,
             hidden_size=16, eval_frequency=400, eval_episodes=3)  # fmt: skip
@@ -41,36 +42,13 @@ def brief(monkeypatch):
 
 def played(run, episodes=2, **options):
     script, args, learner, _ = play.load_run(run, "best")
-    return play.watch(script, args, learner, episodes, seed=5, **options)
-
-
-SCRIPTED = (  # two robots on bp-10, what each starts next: four steps to a small box, the others last for one
-    [7, 7, 0, 5, 7],
-    [1, 6, 6, 7, 7],
-)
-
-
-@pytest.fixture
-def scripted():
-    """The recording of an episode of eight steps on environment 0, beside another one, and of what comes after it."""
-    recorder, pictures = play.Recorder(envs.make("bp-10", num_envs=2, horizon=8)), []
-    recorder.frames, todo, said = pictures, [list(actions) for actions in SCRIPTED], np.arange(2 * 2 * 8.0)
-    _, infos = recorder.reset(seed=0)
-    for step in range(12):
-        actions = np.full((2, 2), 7)
-        if step < 8:
-            actions[0] = [todo[agent].pop(0) if infos["macro_done"][0, agent] else 3 for agent in range(2)]
-        recorder.listen(None, None, (torch.tensor(said + step).reshape(2, 2, 8), None))
-        _, _, terminations, truncations, infos = recorder.step(actions)
-        if (over := terminations | truncations).any():
-            _, infos = recorder.reset(options={"reset_mask": over})
-    assert not any(todo)
-    return recorder.episode(), pictures
+    return play.watch(script, args, learner, episodes, seed=5, **options)[1].episode()
 
 
 # ---- recording ------------------------------------------------------------------------------------------------------
-def test_the_recording_of_a_scripted_episode_is_the_one_done_by_hand(scripted):
-    episode, pictures = scripted
+def test_the_recording_of_a_scripted_episode_is_the_one_done_by_hand():
+    recorder = scripted()
+    episode, pictures = recorder.episode(), recorder.frames
     assert episode.bars(0) == [(0, 1, 7), (1, 2, 7), (2, 6, 0), (6, 7, 5), (7, 8, 7)]
     assert episode.bars(1) == [(0, 4, 1), (4, 5, 6), (5, 6, 6), (6, 7, 7), (7, 8, 7)]
     assert episode.rows() == [0, 1, 2, 4, 5, 6, 7]
@@ -115,7 +93,8 @@ def test_watching_gives_the_results_of_the_script_and_its_first_episode(run, bri
     script, args, learner, _ = play.load_run(run, "best")
     expected = script.evaluate(learner["agents"], envs.make(args.env, 4), args.gamma, 5)
     frames = []
-    result, episode = play.watch(script, args, learner, 4, 5, frames)
+    result, recorder = play.watch(script, args, learner, 4, 5, frames)
+    episode = recorder.episode()
     for key, value in expected.items():
         np.testing.assert_allclose(result[key], value)
     assert len(episode.rewards) == expected["length"][0] == len(frames) - 1
@@ -124,11 +103,100 @@ def test_watching_gives_the_results_of_the_script_and_its_first_episode(run, bri
 
 
 def test_agents_choose_what_their_networks_find_best(run):
-    _, episode = played(run)
+    episode = played(run)
     best = episode.utilities.argmax(2)
     assert len(set(best[episode.chosen].tolist())) > 1 and episode.meaning == "utility"
     np.testing.assert_array_equal(best[episode.chosen], episode.running[episode.chosen])
     assert np.isneginf(episode.utilities[:, 0, 3:]).all(), "a robot has three macro-actions"
+
+
+# ---- rows -----------------------------------------------------------------------------------------------------------
+def printed(lines):
+    """What describe_rows says: of each row what stands left of the bar, of each agent and row what stands right."""
+    halves = [line.split("|") for line in lines if "|" in line][1:]
+    return [left.split() for left, _ in halves if left.strip()], [right.split() for _, right in halves]
+
+
+def test_the_rows_of_a_scripted_episode_are_the_ones_done_by_hand():
+    """Every reward is -0.1, times 10: a row of two steps has -1 - 0.9."""
+    script, recorder = importlib.import_module("avf_qplex"), scripted()
+    args = script.Args(env="bp-10", gamma=0.9, reward_scale=10.0)
+    rows, agents = printed(play.describe_rows(script, args, recorder, 0, 7))
+    assert rows == [
+        ["0", "0", "1", "-1.0000", "0.9000"],
+        ["1", "1", "1", "-1.0000", "0.9000"],
+        ["2", "2", "2", "-1.9000", "0.8100"],
+        ["3", "4", "1", "-1.0000", "0.9000"],
+        ["4", "5", "1", "-1.0000", "0.9000"],
+        ["5", "6", "1", "-1.0000", "0.9000"],
+        ["6", "7", "1", "-1.0000", "0.9000"],  # cut off by the horizon, not terminal
+        ["7", "8", "end"],
+    ]
+    assert [agent[:4] for agent in agents[:8] + agents[-2:]] == [
+        ["0", "Stay", "0", "chosen"],
+        ["1", "Go-to-Small-Box(1)", "0", "chosen"],
+        ["0", "Stay", "1", "chosen"],
+        ["1", "Go-to-Small-Box(1)", "0", "ongoing"],
+        ["0", "Go-to-Small-Box(0)", "2", "chosen"],
+        ["1", "Go-to-Small-Box(1)", "0", "ongoing"],
+        ["0", "Go-to-Small-Box(0)", "2", "ongoing"],
+        ["1", "Turn-right", "3", "chosen"],
+        ["0", "-", "7", "free"],
+        ["1", "-", "7", "free"],
+    ]
+    assert printed(play.describe_rows(script, args, recorder, 2, 3)) == (rows[2:4], agents[4:8])
+    args = dataclasses.replace(args, discount="decision")
+    rows, _ = printed(play.describe_rows(script, args, recorder, 2, 2))
+    assert rows == [["2", "2", "2", "-2.0000", "0.9000"]], "gamma once a row"
+    recorder.steps[-1] = recorder.steps[-1]._replace(terminated=np.array([True]))
+    assert printed(play.describe_rows(script, args, recorder, 6, 6))[0] == [["6", "7", "1", "-1.0000", "0.0000"]]
+    with pytest.raises(ValueError, match="the episode has rows 0 to 7"):
+        play.describe_rows(script, args, recorder, 7, 8)
+
+
+def test_what_an_agent_last_saw_stays_until_it_chooses():
+    """Robot 0 waits for a tool, robot 1 is in the tool room from time 2 on, the arm has found tool 0 at time 6."""
+    script, recorder = importlib.import_module("avf_qplex"), play.Recorder(envs.make("wtd-s", horizon=7))
+    _, infos = recorder.reset(seed=0)
+    for _ in range(7):
+        _, _, _, _, infos = recorder.step(np.where(infos["macro_done"], [[2, 1, 3]], infos["macro_action"]))
+    rows, agents = printed(play.describe_rows(script, script.Args(), recorder, 0, 5))
+    assert [row[1] for row in rows] == ["0", "2", "3", "4", "5", "6"]
+    nowhere, room = "0 0 0 1 0 0 0 0 0 0 0 0 0".split(), "0 1 0 0 0 0 0 0 0 0 0 0 0".split()
+    assert (
+        agents[12:]
+        == [  # at time 5 and at time 6
+            ["0", "Get-Tool", "0", "ongoing", *nowhere],
+            ["1", "Go-TR", "4", "chosen", *room],
+            ["A", "Search-Tool(0)", "0", "ongoing", *"00000"],
+            ["0", "Get-Tool", "0", "ongoing", *nowhere],
+            ["1", "Go-TR", "5", "chosen", *room[:11], "1", "0"],
+            ["A", "Search-Tool(0)", "5", "chosen", *"10010"],
+        ]
+    )
+
+
+def test_what_is_printed_is_what_is_sampled_for_learning():
+    script, recorder = importlib.import_module("avf_qmix"), scripted()
+    args, rng = script.Args(env="bp-10"), np.random.default_rng(0)
+    batch = play.remember(script, args, recorder.steps).sample(1, 100, "joint", rng)
+    rows, agents = printed(play.describe_rows(script, args, recorder, 0, 7))
+    assert batch["valid"][0].tolist() == [True] * 7 + [False]
+    np.testing.assert_allclose(batch["reward"][0, :7], [float(row[3]) for row in rows[:7]], atol=6e-5)
+    np.testing.assert_allclose(batch["discount"][0, :7], [float(row[4]) for row in rows[:7]], atol=6e-5)
+    assert batch["chosen"][0, :7].flatten().tolist() == [agent[3] == "chosen" for agent in agents[:14]]
+    names = recorder.episode().names[0]
+    assert batch["action"][0, :7].flatten().tolist() == [names.index(agent[1]) for agent in agents[:14]]
+
+
+@pytest.mark.parametrize("env_id", ["bp-30", "wtd-t1", "ct-10"])
+def test_rows_fit_a_terminal(env_id):
+    script, recorder = importlib.import_module("avf_vdn"), play.Recorder(envs.make(env_id, horizon=30))
+    recorder.reset(seed=1)
+    for _ in range(30):
+        recorder.step(np.ones((1, recorder.n_agents), int))
+    lines = play.describe_rows(script, script.Args(env=env_id), recorder, 0, 3)
+    assert max(map(len, lines)) <= 120 and not any(line.endswith("...") for line in lines)
 
 
 # ---- the command line -----------------------------------------------------------------------------------------------
@@ -154,23 +222,25 @@ def test_what_is_printed(run, brief, capsys, monkeypatch):
 
 
 def test_the_files_that_are_written(run, tmp_path, brief, capsys):
-    gif, timeline, part = tmp_path / "team.GIF", tmp_path / "team.png", tmp_path / "part.png"
-    play.main([str(run), "--episodes=2", f"--gif={gif}", f"--timeline={timeline}"])
+    gif, whole_png, part = tmp_path / "team.GIF", tmp_path / "team.png", tmp_path / "part.png"
+    play.main([str(run), "--episodes=2", f"--gif={gif}", f"--timeline={whole_png}"])
     play.main([str(run), "--episodes=1", f"--timeline={part}", "--steps=0-12"])
-    with Image.open(gif) as animation, Image.open(timeline) as whole, Image.open(part) as enlarged:
+    with Image.open(gif) as animation, Image.open(whole_png) as whole, Image.open(part) as enlarged:
         assert animation.n_frames == 13 and animation.format == "GIF"
         assert animation.size == Image.fromarray(envs.make("wtd-s")._draw(0)).size
         assert whole.format == enlarged.format == "PNG"
-        assert whole.width == enlarged.width == 2 * play.WIDTH and whole.height < enlarged.height
+        assert whole.width == enlarged.width == 2 * timeline.WIDTH and whole.height < enlarged.height
     assert sorted(path.name for path in tmp_path.iterdir()) == ["part.png", "team.GIF", "team.png"]
 
 
 @pytest.mark.parametrize("name", play.SCRIPTS)
 def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
     folder = train(name, "bp-10", tmp_path, total_timesteps=600)
-    play.main([str(folder), "--episodes=2", f"--timeline={tmp_path / 'team.png'}", "--steps=0-3"])
-    assert f"bp-10 {name} best model" in capsys.readouterr().out and (tmp_path / "team.png").exists()
-    _, episode = played(folder, 1)
+    play.main([str(folder), "--episodes=2", f"--timeline={tmp_path / 'team.png'}", "--steps=0-3", "--rows=0-1"])
+    out = capsys.readouterr().out
+    assert f"bp-10 {name} best model" in out and printed(out.splitlines())[0][0][:2] == ["0", "0"]
+    assert (tmp_path / "team.png").exists()
+    episode = played(folder, 1)
     if name == "cen_maddrqn":
         assert episode.utilities is None
     else:
@@ -188,6 +258,9 @@ def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
         (["--seed=-1"], "--seed must not be negative, got -1"),
         (["--model=worst"], "invalid choice: 'worst'"),
         (["--render"], "unrecognized arguments: --render"),
+        (["--rows=4"], "--rows must be two rows, the second not before the first, such as 0-8"),
+        (["--rows=4-3"], "--rows must be two rows, the second not before the first, such as 0-8"),
+        (["--rows=0-99"], "--rows 0-99 is out of range: the episode has rows 0 to "),
         (["--steps=0-4"], "--steps needs --timeline"),
         (["--timeline={}/team.png", "--steps=4"], "--steps must be two times, the second after the first"),
         (["--timeline={}/team.png", "--steps=4-4"], "--steps must be two times, the second after the first"),
@@ -255,136 +328,3 @@ def test_folders_that_are_no_runs_end_with_one_line(run, tmp_path):
     assert play.load_run(model(device="cuda"), "best")[1].device == "cpu"
     with pytest.raises(SystemExit, match=r"^play: .*last\.pt"):
         play.load_run(tmp_path, "last")
-
-
-# ---- the timeline ---------------------------------------------------------------------------------------------------
-@pytest.fixture
-def spy(monkeypatch):
-    """What is drawn, in pixels of the whole picture: texts as (words, left, top, right, bottom), dots as (x, y)."""
-    texts, dots = [], []
-    text, dot = Canvas.text, play._draw_dot
-
-    def spy_text(self, x, y, words, size=14.0, fill=None, anchor="l", **options):
-        width, high = self.width(words, size) * self.unit, 0.72 * size * self.unit  # as high as capital letters
-        left = self.x + x * self.unit - {"l": 0, "m": width / 2, "r": width}[anchor]
-        middle = self.y + y * self.unit
-        if words != "":
-            texts.append((str(words), left, middle - high / 2, left + width, middle + high / 2))
-        text(self, x, y, words, size, *([fill] if fill else []), anchor=anchor, **options)
-
-    def spy_dot(canvas, x, y):
-        dots.append((canvas.x + x * canvas.unit, canvas.y + y * canvas.unit))
-        dot(canvas, x, y)
-
-    monkeypatch.setattr(Canvas, "text", spy_text)
-    monkeypatch.setattr(play, "_draw_dot", spy_dot)
-    return texts, dots
-
-
-def said(texts):
-    return [words for words, *_ in texts]
-
-
-def test_a_dot_and_a_name_for_each_macro_action_and_a_number_for_each_row(scripted, spy):
-    episode, (texts, dots) = scripted[0], spy
-    play.draw_timeline(episode, "title", "facts")
-    words, pitch = said(texts), (play.WIDTH - play.LEFT - play.RIGHT) / 8
-    lanes = sorted({y for _, y in dots})[-2:]  # the others are in the legend and in the example
-    for agent, lane in enumerate(lanes):
-        times = [(x / 4 - play.LEFT) / pitch for x, y in dots if y == lane]
-        np.testing.assert_allclose(times, [start for start, _, _ in episode.bars(agent)], atol=1e-6)
-    for name in ("Go-to-Small-Box(0) · 4", "Go-to-Small-Box(1) · 4", "Turn-left · 1", "Turn-right · 1"):
-        assert name in words
-    start = words.index("row")
-    assert words[start + 1 : start + 9] == ["0", "1", "2", "3", "4", "5", "6", "end"]
-    assert "mostly -0.1" in words and words[words.index("return so far") + 1] == "-0.8"
-
-
-def test_the_marked_row_says_who_chooses_and_who_is_ongoing(scripted, spy):
-    episode, (texts, _) = scripted[0], spy
-    assert play.example_row(episode, 0, 8) == 1
-    assert play.example_row(episode, 1, 8) == 2
-    assert play.example_row(episode, 5, 8) is None  # at 6 and 7 both choose
-    wide = np.zeros((20, 2), bool)
-    wide[[0, 4, 5, 11, 18], 0] = wide[[0, 18], 1] = True
-    assert play.example_row(episode._replace(chosen=wide), 0, 20) == 11, "far from other rows"
-    play.draw_timeline(episode, "title", "facts")
-    words = said(texts)
-    start = words.index("row 1, t = 1")
-    assert words[words.index("chosen now:", start) + 2] == "Stay"
-    assert words[words.index("running macro-actions of the ongoing agents, which have no dot:") + 2] == (
-        "Go-to-Small-Box(1)"
-    )
-    assert words.count("m") == 2  # in the explanation and on the one ongoing agent's bar
-    together = episode._replace(chosen=np.ones_like(episode.chosen))
-    play.draw_timeline(together, "title", "facts")
-    assert "Up to t = 8 all agents choose at every row: nobody is ongoing." in said(texts)
-
-
-def test_an_enlarged_part_shows_the_best_utilities_and_only_that_part(scripted, spy):
-    episode, (texts, dots) = scripted[0], spy
-    episode = episode._replace(utilities=np.tile(np.arange(8.0) / 4 - 1, (8, 2, 1)))
-    play.draw_timeline(episode, "title", "facts", steps=(3, 7))
-    words = said(texts)
-    lanes = sorted({y for _, y in dots})[-2:]
-    assert [sum(y == lane for _, y in dots) for lane in lanes] == [1, 3]
-    start = words.index("0.75") - 1
-    assert words[start : start + 6] == ["Stay", "0.75", "Turn-right", "0.50", "Turn-left", "0.25"]
-    assert "... Go-to-Small-Box(0) · 4" in words and "the 3 of highest utility" in words
-    assert not {"0.00", "-1.00", "end"} & set(words)
-    times = [float(word) for word in words[words.index("time t") + 1 :]]
-    assert times == [3, 4, 5, 6, 7]
-
-
-@pytest.mark.parametrize("env_id", ["bp-10", "wtd-s", "wtd-t1", "ct-10", "wtd-s-primitive"])
-@pytest.mark.parametrize("steps", [None, (0, 40), (3, 8)])
-def test_no_text_covers_another_or_leaves_the_picture(env_id, steps, spy):
-    recorder, rng, (texts, _) = play.Recorder(envs.make(env_id)), np.random.default_rng(1), spy
-    recorder.reset(seed=1)
-    while not recorder.over:
-        utilities = torch.tensor(rng.normal(0, 60, (recorder.n_agents, 1, max(recorder.n_actions))))
-        for agent, count in enumerate(recorder.n_actions):
-            utilities[agent, :, count:] = -torch.inf
-        recorder.listen(None, None, (utilities, None))
-        recorder.step(rng.integers(recorder.n_actions, size=(1, recorder.n_agents)))
-    episode = recorder.episode()
-    episode = episode._replace(rewards=rng.integers(-120, 120, len(episode.rewards)) / 10)
-    if steps:
-        steps = (steps[0], min(steps[1], len(episode.rewards)))
-    picture = play.draw_timeline(episode, f"{env_id} avf_qplex", "A greedy episode", steps)
-    height, width, _ = picture.shape
-    boxes = np.array([box for _, *box in texts])
-    assert (boxes[:, :2] >= 0).all() and (boxes[:, 2:] <= (2 * width, 2 * height)).all()
-    left, top, right, bottom = boxes.T
-    apart = (left[:, None] >= right) | (left >= right[:, None]) | (top[:, None] >= bottom) | (top >= bottom[:, None])
-    covered = [(texts[one][0], texts[other][0]) for one, other in np.argwhere(~apart) if one < other]
-    assert not covered
-
-
-def test_the_colours_are_those_of_the_rendering(scripted):
-    picture = play.draw_timeline(scripted[0], "title", "facts")
-    middle = picture.shape[0] - 2 * (play.FOOT + 14)
-    lanes = [picture[middle - 2 * play.LANE * (2 - agent) + 12] for agent in range(2)]  # in the upper part of the bars
-    for lane, (colour, _) in zip(lanes, AGENTS[:2], strict=True):
-        rgb = tuple(bytes.fromhex(colour[1:]))
-        assert (lane == rgb).all(1).mean() > 0.7
-
-
-def test_abbreviations_of_one_agents_macro_actions_differ():
-    for env_id in envs.IDS:
-        for names in envs.make(env_id).macro_action_names:
-            assert len({play.shorten(name) for name in names}) == len(names)
-    assert [play.shorten(name) for name in ("Pass-to-M(0)", "Go-TR", "Stay", "N")] == ["PtM(0)", "GTR", "St", "N"]
-
-
-def test_names_without_room_are_shortened_or_put_below_and_explained(scripted, spy):
-    """17 pixels a step: too few for a name of one step (those of one kind share a bracket) and, often, of three."""
-    episode, (texts, _) = scripted[0], spy
-    chosen, running = np.ones((50, 2), bool), np.full((50, 2), 4)
-    chosen[[10, 11, 13, 14], 1], running[9:12, 1], running[12:15, 1] = False, 0, 6
-    episode = episode._replace(chosen=chosen, running=running, rewards=np.zeros(50))
-    play.draw_timeline(episode, "title", "facts")
-    words = said(texts)
-    assert "Push x50" in words and "Push x9" in words and "Push x35" in words
-    assert not {"Push · 1", "Go-to-Small-Box(0) · 3", "Turn-right · 3"} & set(words)
-    assert "GtSB(0)" in words and "Tr" in words and words[-1] == "GtSB: Go-to-Small-Box · Tr: Turn-right"
