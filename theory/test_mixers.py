@@ -29,7 +29,7 @@ from theory.expressiveness import (
 from theory.expressiveness import cone as cone_of
 from theory.igm import TIES, igm, mac_igm, mac_igm_batch, situations
 from theory.test_igm import NUMBERS
-from theory.variants import SeeOngoing, StateOnly
+from theory.variants import SeeOngoing, StateOnly, two_by_two
 
 ALWAYS = {
     **{name: MIXERS[name] for name in ("VDN", "QMIX", "as shipped", "told m^-")},
@@ -160,23 +160,6 @@ def test_conditioned_qplex_has_the_ties_of_its_utilities_and_no_others(name, siz
 
 
 # Item 5: what QPLEX needs.
-
-
-def two_by_two(**options):
-    """A QPLEX network small enough to read, for 2 agents with macro-actions a, b and a state of width 1.
-
-    w_i = 1, b_i = 0, lambda_i = 8 sigmoid(0) sigmoid(action_i(m)), hence lambda_1 = 1, and lambda_2 = 3 if agent 1
-    takes a, 1 if it takes b. (1e-10 is added to w_i.)
-    """
-    mixer = QPLEXMixer([2, 2], 1, embed=1, heads=1, **options).double().requires_grad_(False)
-    for parameter in mixer.parameters():
-        parameter.zero_()
-    log3 = np.log(3.0)  # sigmoid(log 3) = 3/4, sigmoid(-log 3) = 1/4
-    mixer.of_state[-1].bias.copy_(torch.tensor([1, 1, 0, 0, 8, 0, 0]))  # w_1, w_2, b_1, b_2, key, agent_1, agent_2
-    mixer.of_action[0].weight.copy_(torch.tensor([[0, 1, 0, 0, 0]]))  # of state, m_1 = a, m_1 = b, m_2 = a, m_2 = b
-    mixer.of_action[-1].weight.copy_(torch.tensor([[0], [2 * log3]]))
-    mixer.of_action[-1].bias.copy_(torch.tensor([-log3, -log3]))
-    return mixer
 
 
 def test_smallest_counterexample_of_literal_qplex():

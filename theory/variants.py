@@ -1,5 +1,7 @@
-"""Mixers that only the theory needs: QPLEX whose weights see more, or less, than the script's, and VDN as a mixer."""
+"""Mixers that only the theory needs: QPLEX whose weights see more, or less, than the script's, a QPLEX small enough to
+read, and VDN as a mixer."""
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -34,3 +36,20 @@ class StateOnly(QPLEXMixer):
 
     def forward(self, utilities, values, actions, chosen, state):
         return super().forward(utilities, values, torch.zeros_like(actions), chosen, state)
+
+
+def two_by_two(**options):
+    """A QPLEX network small enough to read, for 2 agents with macro-actions a, b and a state of width 1.
+
+    w_i = 1, b_i = 0, lambda_i = 8 sigmoid(0) sigmoid(action_i(m)), hence lambda_1 = 1, and lambda_2 = 3 if agent 1
+    takes a, 1 if it takes b. (1e-10 is added to w_i.)
+    """
+    mixer = QPLEXMixer([2, 2], 1, embed=1, heads=1, **options).double().requires_grad_(False)
+    for parameter in mixer.parameters():
+        parameter.zero_()
+    log3 = np.log(3.0)  # sigmoid(log 3) = 3/4, sigmoid(-log 3) = 1/4
+    mixer.of_state[-1].bias.copy_(torch.tensor([1, 1, 0, 0, 8, 0, 0]))  # w_1, w_2, b_1, b_2, key, agent_1, agent_2
+    mixer.of_action[0].weight.copy_(torch.tensor([[0, 1, 0, 0, 0]]))  # of state, m_1 = a, m_1 = b, m_2 = a, m_2 = b
+    mixer.of_action[-1].weight.copy_(torch.tensor([[0], [2 * log3]]))
+    mixer.of_action[-1].bias.copy_(torch.tensor([-log3, -log3]))
+    return mixer
