@@ -2,6 +2,7 @@
 
     python benchmark/speed.py                               a table
     python benchmark/speed.py --against ../other-checkout   update and train here and there, in turn
+    python benchmark/speed.py --scaling                     Capture Target of other sizes: the tables of docs/scaling.md
 
     act      a script's choice for one environment
     env      a step of one environment, with random macro-actions; resets included
@@ -10,10 +11,16 @@
 
 CPU milliseconds of one thread, the median of several rounds. Training goes through the command line, so the other
 checkout may be of any age; what takes little of a run, such as the updates of Mac-IAICC, needs more --steps.
+
+With --scaling, every measure is taken in a process of its own, with a full replay buffer: env and act as above in
+microseconds, update in milliseconds (one thread, medians), then the weights of the mixer in thousands, the replay
+buffer and the most memory that the process held, in MB.
 """
 
 import argparse
+import copy
 import itertools
+import multiprocessing
 import os
 import resource
 import subprocess
@@ -29,8 +36,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script,
 
 import envs
 from benchmark import record
+from envs.capture_target import CaptureTarget
 
 CALLS = 200
+SIZE = {"agents": 10, "envs": 32, "grid": 10, "horizon": 60}  # where nothing else is said
+STATES = [("avf_vdn", None), *itertools.product(("avf_qmix", "avf_qplex"), ("joint", "decision"))]
+SCALING = (  # what grows, over which values, for which scripts
+    ("agents", (2, 5, 10, 20, 50), STATES),
+    ("envs", (32, 128, 512, 2_048), STATES[:1]),
+    ("grid", (10, 20, 40), STATES[3:4]),
+    ("horizon", (60, 120, 240), STATES[3:4]),
+)
 
 
 def acting(script, args, rounds):
@@ -78,6 +94,76 @@ def training(checkouts, name, args, steps, rounds):
     return {"update": (total - without) / updates, "train": (total - begin) / steps}
 
 
+def scale(name, mixer_state, size, updates):
+    """The numbers of --scaling, six floats, of a script on Capture Target of a size, to be run in a process of its own.
+    mixer_state: None for a script without a mixer. size: as SIZE. updates: how many are timed."""
+    torch.set_num_threads(1)
+    script, env_id = record.load_script(name), "ct-" + "-".join(str(size[key]) for key in ("agents", "grid", "horizon"))
+    if envs.problem(env_id):
+        envs.register(env_id, CaptureTarget, n_agents=size["agents"], grid=size["grid"], horizon=size["horizon"])
+    state = {"mixer_state": mixer_state} if mixer_state else {}
+    args = script.parse_args([f"--env={env_id}", *(f"--mixer-state={each}" for each in state.values())])
+    env, rng = envs.make(env_id, size["envs"]), np.random.default_rng(0)
+    learner, buffer = script.make_learner(args, env), script.ReplayBuffer(env, args.buffer_size)
+    memory = [x for key, x in vars(buffer).items() if key not in ("rows", "queue", "writing")]
+    for array in memory:
+        array.fill(0)  # a full buffer: what is not written to takes no memory
+    (obs, infos), hidden, acting, stepping, learning = (
+        env.reset(seed=0),
+        learner["agents"].start(env.num_envs),
+        [],
+        [],
+        [],
+    )
+    for _ in range(env.horizon):
+        states, start = (infos["state"],) if state else (), time.process_time()
+        actions, hidden = script.act(learner["agents"], obs, infos, hidden, 1.0, rng)
+        acting.append(time.process_time() - start)
+        buffer.add(obs, actions, infos["macro_done"], *states)
+        start = time.process_time()
+        obs, rewards, terminations, truncations, infos = env.step(actions)
+        stepping.append(time.process_time() - start)
+        over = terminations | truncations
+        buffer.step(*states, rewards, args.gamma * ~terminations, over, obs, infos)
+        if over.any():
+            obs, infos = env.reset(options={"reset_mask": over})
+    target, fast = copy.deepcopy(learner).requires_grad_(False), list(learner.parameters())
+    optimizer, slow = torch.optim.Adam(fast, fused=True), list(target.parameters())
+    mixers = [part["mixer"] for part in (learner, target)] if state else []
+    for _ in range(updates):  # as in `train` of the script
+        start = time.process_time()
+        batch = buffer.sample(args.batch_size, args.window, *state.values(), rng)
+        utilities = script.over_rows(batch, learner["agents"], target["agents"])
+        loss, _, _ = script.td_loss(*utilities, *mixers, batch, args.td_lambda, args.hysteresis)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
+        optimizer.step()
+        torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)(slow, fast, None)
+        learning.append(time.process_time() - start)
+    weights = sum(x.numel() for x in mixers[0].parameters()) if state else 0
+    unit = 2**10 if sys.platform == "linux" else 1  # of ru_maxrss, in bytes
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    each = [1e6 * np.median(seconds) / env.num_envs for seconds in (stepping, acting)]
+    return *each, 1e3 * np.median(learning), weights / 1e3, sum(x.nbytes for x in memory) / 1e6, peak
+
+
+def print_scaling(updates):
+    """The tables of --scaling, in Markdown."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["gymnasium", "pandas", "torch", "torch.utils.tensorboard"])  # once for all measures
+    for axis, values, scripts in SCALING:
+        print(
+            f"\n| script | mixer state | {axis} | env, us | act, us | update, ms | mixer, k | replay, MB | peak, MB |"
+        )
+        print("|" + " --- |" * 9)
+        for (name, mixer_state), value in itertools.product(scripts, values):
+            with context.Pool(1) as pool:  # a process for each measure
+                found = pool.apply(scale, (name, mixer_state, {**SIZE, axis: value}, updates))
+            cells = name, mixer_state or "none", f"{value:,}", *(f"{x:,.0f}" if x >= 10 else f"{x:.1f}" for x in found)
+            print("| " + " | ".join(cells) + " |", flush=True)
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: sys.exit(f"speed: {message}")
@@ -88,7 +174,14 @@ def main(argv=None):
     add("--steps", type=int, default=10_000, help="environment steps of a training run (default: %(default)s)")
     add("--rounds", type=int, default=3, help="default: %(default)s")
     add("--against", metavar="FOLDER", type=Path, help="another checkout to compare with")
+    add("--scaling", action="store_true", help="tables of cost and memory by size instead; goes with --rounds alone")
     args = parser.parse_args(argv)
+    if args.scaling:
+        if any(v != parser.get_default(k) for k, v in vars(args).items() if k not in ("scaling", "rounds")):
+            fail("--scaling measures sizes of its own: only --rounds goes with it")
+        if args.rounds < 1:
+            fail("--rounds must be at least 1")
+        return print_scaling(5 * args.rounds)
     if min(args.steps, args.rounds, 1 if args.num_envs is None else args.num_envs) < 1:
         sys.exit("speed: --num-envs, --steps and --rounds must be at least 1")
     if args.against and not args.against.is_dir():

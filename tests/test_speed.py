@@ -1,6 +1,7 @@
 """The speed table: every measure is taken, and two checkouts are compared fairly."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -104,11 +105,61 @@ def test_a_script_that_fails_is_named(tmp_path, monkeypatch):
         speed.main([*TINY, "--against", str(tmp_path)])
 
 
+SMALL = {"agents": 2, "envs": 4, "grid": 4, "horizon": 6}
+
+
+def test_scaling_prints_a_table_for_each_axis(capsys, monkeypatch):
+    """Each measure in a process of its own: the most memory that it held is more than the replay buffer."""
+    monkeypatch.setattr(speed, "SIZE", SMALL)
+    monkeypatch.setattr(speed, "SCALING", (("agents", (2,), speed.STATES[1:2]), ("horizon", (6,), speed.STATES[:1])))
+    speed.main(["--scaling", "--rounds", "1"])
+    blank, agents, rule, qmix, _, horizon, _, vdn = capsys.readouterr().out.splitlines()
+    assert blank == "" and rule == "|" + " --- |" * 9
+    assert agents.split(" | ")[2] == "agents" and horizon.split(" | ")[2] == "horizon"
+    for line, start in ((qmix, ["avf_qmix", "joint", "2"]), (vdn, ["avf_vdn", "none", "6"])):
+        cells = line.strip("| ").split(" | ")
+        assert cells[:3] == start and len(cells) == 9
+        env, act, update, weights, replay, peak = (float(cell.replace(",", "")) for cell in cells[3:])
+        assert 0 < env < 1e5 and 0 < act < 1e5 and 0 < update < 1e5 and (weights > 0) == (start[0] == "avf_qmix")
+        assert peak > replay + 50
+
+
+def test_scaling_counts_weights_and_bytes():
+    """QMIX: the hypernetworks of W_1, w_2 and b_2, and b_1, for a state of n or 1 times 2 (n + 1) numbers. A row of the
+    replay buffer: an observation of 4 and two integers for each agent, two states, reward and discount."""
+    for agents in (2, 3):
+        for state, width in (("joint", agents * 2 * (agents + 1)), ("decision", 2 * (agents + 1))):
+            *_, weights, replay, peak = speed.scale("avf_qmix", state, {**SMALL, "agents": agents}, 1)
+            outputs = (agents * 32, 32, 1)
+            assert 1e3 * weights == pytest.approx(sum((width + 1) * 32 + 33 * n for n in outputs) + (width + 1) * 32)
+            row = agents * (4 * 4 + 2 * 8) + 2 * 4 * 2 * (agents + 1) + 2 * 4
+            assert 1e6 * replay == pytest.approx((2_500 + 4) * (6 + 1) * row) and peak > replay
+    assert speed.scale("avf_vdn", None, SMALL, 1)[3] == 0
+
+
+def test_a_measure_times_the_script(monkeypatch):
+    """An update that takes 20 ms longer is seen to, in the update alone."""
+    script = speed.record.load_script("avf_vdn")
+    real = script.td_loss
+
+    def slow(*arguments):
+        start = time.process_time()
+        while time.process_time() < start + 0.02:
+            pass
+        return real(*arguments)
+
+    before = speed.scale("avf_vdn", None, SMALL, 3)
+    monkeypatch.setattr(script, "td_loss", slow)
+    after = speed.scale("avf_vdn", None, SMALL, 3)
+    assert after[2] > 20 and after[2] - before[2] > 10
+
+
 def test_bad_input_is_one_line(tmp_path):
     for flags, message in (
         (["--rounds", "0"], "--num-envs, --steps and --rounds"),
         (["--scripts", "dqn"], "argument --scripts: invalid choice: 'dqn'"),
         (["--num-envs", "0"], "--num-envs, --steps and --rounds"),
+        (["--scaling"], "--scaling measures sizes of its own"),  # beside the others
         (["--against", str(tmp_path / "nowhere")], "is no folder"),
     ):
         with pytest.raises(SystemExit) as error:
