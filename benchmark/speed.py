@@ -178,9 +178,9 @@ def main(argv=None):
     args = parser.parse_args(argv)
     if args.scaling:
         if any(v != parser.get_default(k) for k, v in vars(args).items() if k not in ("scaling", "rounds")):
-            fail("--scaling measures sizes of its own: only --rounds goes with it")
+            sys.exit("speed: --scaling measures sizes of its own: only --rounds goes with it")
         if args.rounds < 1:
-            fail("--rounds must be at least 1")
+            sys.exit("speed: --rounds must be at least 1")
         return print_scaling(5 * args.rounds)
     if min(args.steps, args.rounds, 1 if args.num_envs is None else args.num_envs) < 1:
         sys.exit("speed: --num-envs, --steps and --rounds must be at least 1")
