@@ -108,13 +108,9 @@ def scale(name, mixer_state, size, updates):
     memory = [x for key, x in vars(buffer).items() if key not in ("rows", "queue", "writing")]
     for array in memory:
         array.fill(0)  # a full buffer: what is not written to takes no memory
-    (obs, infos), hidden, acting, stepping, learning = (
-        env.reset(seed=0),
-        learner["agents"].start(env.num_envs),
-        [],
-        [],
-        [],
-    )
+    acting, stepping, learning = [], [], []
+    obs, infos = env.reset(seed=0)
+    hidden = learner["agents"].start(env.num_envs)
     for _ in range(env.horizon):
         states, start = (infos["state"],) if state else (), time.process_time()
         actions, hidden = script.act(learner["agents"], obs, infos, hidden, 1.0, rng)
