@@ -15,8 +15,7 @@ Numbered deviations from the paper:
  2. A_i = Q_i - max Q_i (Eq. 4), not a dueling head (Def. 3.3): advantages of any sign break Mac-IGM (theory/README.md).
  3. The mixer's hypernetworks share one hidden layer of the same total width instead of having one each.
  4. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
- 5. Values are ours (docs/defaults.md), as are whole episodes instead of windows of 25, random play before learning,
-    Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
+ 5. Ours (docs/defaults.md): values, whole episodes, random start, Q(lambda), hysteresis, scales, falling step size.
 """
 
 import argparse
@@ -90,7 +89,8 @@ class Args:
 
 # Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(discount="decision", learning_starts=200_000, total_timesteps=450_000, td_lambda=0.5, hysteresis=0.1),
+    "bp": dict(discount="decision", learning_starts=150_000, exploration_timesteps=250_000, total_timesteps=600_000,
+               td_lambda=0.5, hysteresis=0.1),
     "wtd-t": dict(total_timesteps=800_000),
     "ct": dict(num_envs=128, train_frequency=256, gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8,
                total_timesteps=600_000, eval_frequency=40_000, eval_episodes=400),

@@ -15,8 +15,7 @@ new is the network `Team`, whose joint macro-actions that would change an ongoin
 Numbered deviations from the paper and its baseline:
  1. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
  2. The network is told which agents are free and the macro-actions before; the published one sees macro-observations.
- 3. Values are ours (docs/defaults.md), as are whole episodes instead of windows of 25, random play before learning,
-    Q(lambda), hysteresis, scaled inputs and rewards, a falling step size.
+ 3. Ours (docs/defaults.md): values, whole episodes, random start, Q(lambda), hysteresis, scales, falling step size.
 """
 
 import argparse
@@ -88,7 +87,8 @@ class Args:
 
 # Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(discount="decision", learning_starts=200_000, total_timesteps=450_000, td_lambda=0.5, hysteresis=0.1),
+    "bp": dict(discount="decision", learning_starts=150_000, exploration_timesteps=250_000, total_timesteps=600_000,
+               td_lambda=0.5, hysteresis=0.1),
     "wtd-t": dict(total_timesteps=800_000),
     "ct": dict(num_envs=128, train_frequency=256, gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8,
                total_timesteps=600_000, eval_frequency=40_000, eval_episodes=400),

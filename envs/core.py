@@ -73,11 +73,11 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     @abstractmethod
     def _advance(self):
-        """One step of `macro_action`, started in this step where `macro_done`.
+        """One step of `macro_action`, started in this step where `macro_done`. `elapsed` counts the step already.
 
         Returns:
             rewards float64 [N], terminations bool [N], ended bool [N, n] (macro-actions that end now), success bool
-            [N].
+            [N], in one step of an episode at most (evaluation adds it up).
         """
 
     @abstractmethod
