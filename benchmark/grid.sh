@@ -22,9 +22,9 @@ python benchmark/sweep.py --seeds 41-50 --workers 2 --record --algos cen_maddrqn
 
 # Figure 8: Mac-IAICC with as much time as AVF-QPLEX, and as many evaluations. CPU time of training on one machine, by
 #   python benchmark/speed.py --scripts avf_qplex mac_iaicc --envs bp-30 wtd-t1 --rounds 1 --steps 12000 (mac_iaicc: 100000)
-# bp-30: AVF-QPLEX 0.34 ms a step where it learns and 0.09 before, 98 s a run; Mac-IAICC 0.081 ms, hence 1,200,000 steps.
+# bp-30: AVF-QPLEX 0.34 ms a step where it learns and 0.09 before, 166 s a run; Mac-IAICC 0.081 ms, hence 2,000,000 steps.
 # wtd-t1: AVF-QPLEX 1.02 ms, 816 s a run; Mac-IAICC 0.097 ms, hence 8,400,000 steps. The machine was busy; ratios count.
-python benchmark/sweep.py --seeds 41-50 --workers 2 --record --variant same-time --algos mac_iaicc --envs bp-30 -- --total-timesteps 1200000 --eval-frequency 30000
+python benchmark/sweep.py --seeds 41-50 --workers 2 --record --variant same-time --algos mac_iaicc --envs bp-30 -- --total-timesteps 2000000 --eval-frequency 40000
 python benchmark/sweep.py --seeds 41-50 --workers 2 --record --variant same-time --algos mac_iaicc --envs wtd-t1 -- --total-timesteps 8400000 --eval-frequency 100000
 
 # Table 3: primitive actions
