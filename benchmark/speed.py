@@ -41,12 +41,12 @@ from envs.capture_target import CaptureTarget
 CALLS = 200
 SIZE = {"agents": 10, "envs": 32, "grid": 10, "horizon": 60}  # where nothing else is said
 STATES = [("avf_vdn", None), *itertools.product(("avf_qmix", "avf_qplex"), ("joint", "decision"))]
-SCALING = (  # what grows, over which values, for which scripts
-    ("agents", (2, 5, 10, 20, 50), STATES),
-    ("envs", (32, 128, 512, 2_048), STATES[:1]),
-    ("grid", (10, 20, 40), STATES[3:4]),
-    ("horizon", (60, 120, 240), STATES[3:4]),
-)
+SCALING = {  # what grows, over which values
+    "agents": (2, 5, 10, 20, 50),
+    "envs": (32, 128, 512, 2_048),
+    "grid": (10, 20, 40),
+    "horizon": (60, 120, 240),
+}
 
 
 def acting(script, args, rounds):
@@ -148,12 +148,10 @@ def print_scaling(updates):
     """The tables of --scaling, in Markdown."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["gymnasium", "pandas", "torch", "torch.utils.tensorboard"])  # once for all measures
-    for axis, values, scripts in SCALING:
-        print(
-            f"\n| script | mixer state | {axis} | env, us | act, us | update, ms | mixer, k | replay, MB | peak, MB |"
-        )
-        print("|" + " --- |" * 9)
-        for (name, mixer_state), value in itertools.product(scripts, values):
+    for axis, values in SCALING.items():
+        titles = "script", "mixer state", axis, "env, us", "act, us", "update, ms", "mixer, k", "replay, MB", "peak, MB"
+        print(f"\n| {' | '.join(titles)} |\n|{' --- |' * len(titles)}")
+        for (name, mixer_state), value in itertools.product(STATES, values):
             with context.Pool(1) as pool:  # a process for each measure
                 found = pool.apply(scale, (name, mixer_state, {**SIZE, axis: value}, updates))
             cells = name, mixer_state or "none", f"{value:,}", *(f"{x:,.0f}" if x >= 10 else f"{x:.1f}" for x in found)

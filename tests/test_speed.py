@@ -111,9 +111,10 @@ SMALL = {"agents": 2, "envs": 4, "grid": 4, "horizon": 6}
 def test_scaling_prints_a_table_for_each_axis(capsys, monkeypatch):
     """Each measure in a process of its own: the most memory that it held is more than the replay buffer."""
     monkeypatch.setattr(speed, "SIZE", SMALL)
-    monkeypatch.setattr(speed, "SCALING", (("agents", (2,), speed.STATES[1:2]), ("horizon", (6,), speed.STATES[:1])))
+    monkeypatch.setattr(speed, "SCALING", {"agents": (2,), "horizon": (6,)})
+    monkeypatch.setattr(speed, "STATES", [("avf_vdn", None), ("avf_qmix", "joint")])
     speed.main(["--scaling", "--rounds", "1"])
-    blank, agents, rule, qmix, _, horizon, _, vdn = capsys.readouterr().out.splitlines()
+    blank, agents, rule, _, qmix, _, horizon, _, vdn, _ = capsys.readouterr().out.splitlines()
     assert blank == "" and rule == "|" + " --- |" * 9
     assert agents.split(" | ")[2] == "agents" and horizon.split(" | ")[2] == "horizon"
     for line, start in ((qmix, ["avf_qmix", "joint", "2"]), (vdn, ["avf_vdn", "none", "6"])):
