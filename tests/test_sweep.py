@@ -256,8 +256,8 @@ def test_a_value_of_another_family_leaves_the_checksum(tmp_path, monkeypatch):
     (tmp_path / "envs").mkdir()
     text = (ROOT / "avf_vdn.py").read_text()
     for edit, changes in (
-        (("td_lambda=0.8", "td_lambda=0.7"), {"ct-10"}),
-        (("td_lambda=0.5", "td_lambda=0.6"), {"bp-10"}),
+        (("obs_scale=4.0", "obs_scale=3.0"), {"ct-10"}),
+        (("hysteresis=0.1", "hysteresis=0.2"), {"bp-10"}),
         (("# Choose and step", "# Choose, step"), {"bp-10", "wtd-s", "ct-10"}),
         (("gamma: float = 0.95", "gamma: float = 0.94"), {"bp-10", "wtd-s", "ct-10"}),
     ):
