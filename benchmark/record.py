@@ -64,7 +64,7 @@ def checksum(algorithm, env):
 
 def commit():
     """The commit that is checked out, with a + if tracked files were changed since; "" outside git."""
-    command = "git describe --always --exclude='*' --dirty=+"  # by the shell, which need not have a git
+    command = "git describe --always --exclude='*' --dirty=+"  # by the shell: without a git it fails like any command
     return subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
 
 
