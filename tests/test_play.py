@@ -4,6 +4,8 @@ import dataclasses
 import importlib
 import json
 import re
+import subprocess
+import sys
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -231,6 +233,13 @@ def test_the_files_that_are_written(run, tmp_path, brief, capsys):
         assert whole.format == enlarged.format == "PNG"
         assert whole.width == enlarged.width == 2 * timeline.WIDTH and whole.height < enlarged.height
     assert sorted(path.name for path in tmp_path.iterdir()) == ["part.png", "team.GIF", "team.png"]
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(run):
+    command = [sys.executable, play.__file__, str(run), "--episodes=1"]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    program.stdout.close()
+    assert program.stderr.read() == "" and program.wait() == 0
 
 
 @pytest.mark.parametrize("name", play.SCRIPTS)
