@@ -49,21 +49,28 @@ SCALING = {  # what grows, over which values
 }
 
 
-def acting(script, args, rounds):
-    """Seconds of a choice and of a step for one environment, by measure: float64 [rounds, 1]. args: the script's."""
-    env, rng = envs.make(args.env, args.num_envs), np.random.default_rng(0)
-    agents, seconds = script.make_learner(args, env)["agents"], np.zeros((2, rounds, 1))
-    for i in range(rounds):
-        (obs, infos), hidden = env.reset(seed=0), agents.start(args.num_envs)
-        for _ in range(CALLS):
-            start = time.process_time()
-            actions, hidden = script.act(agents, obs, infos, hidden, 1.0, rng)
-            chosen = time.process_time()
-            obs, _, terminations, truncations, infos = env.step(actions)
-            if (over := terminations | truncations).any():
-                obs, infos = env.reset(options={"reset_mask": over})
-            seconds[:, i, 0] += chosen - start, time.process_time() - chosen
-    return dict(zip(("act", "env"), seconds / (CALLS * args.num_envs), strict=True))
+def play(script, args, env, agents, steps, buffer=None):
+    """Seconds of each choice and of each step, resets included, of a batch of environments, float64 [2, steps].
+    args: the script's. buffer: a replay buffer that records what is played, or None."""
+    rng, seconds = np.random.default_rng(0), np.zeros((2, steps))
+    (obs, infos), hidden = env.reset(seed=0), agents.start(env.num_envs)
+    for i in range(steps):
+        states, start = (infos["state"],) if hasattr(args, "mixer_state") else (), time.process_time()
+        actions, hidden = script.act(agents, obs, infos, hidden, 1.0, rng)
+        seconds[0, i] = time.process_time() - start
+        if buffer:
+            buffer.add(obs, actions, infos["macro_done"], *states)
+        start = time.process_time()
+        obs, rewards, terminations, truncations, infos = env.step(actions)
+        seconds[1, i] = time.process_time() - start
+        over = terminations | truncations
+        if buffer:
+            buffer.step(*states, rewards, args.gamma * ~terminations, over, obs, infos)
+        start = time.process_time()
+        if over.any():
+            obs, infos = env.reset(options={"reset_mask": over})
+        seconds[1, i] += time.process_time() - start
+    return seconds
 
 
 def run(checkout, name, flags):
@@ -108,21 +115,7 @@ def scale(name, mixer_state, size, updates):
     memory = [x for key, x in vars(buffer).items() if key not in ("rows", "queue", "writing")]
     for array in memory:
         array.fill(0)  # a full buffer: what is not written to takes no memory
-    acting, stepping, learning = [], [], []
-    obs, infos = env.reset(seed=0)
-    hidden = learner["agents"].start(env.num_envs)
-    for _ in range(env.horizon):
-        states, start = (infos["state"],) if state else (), time.process_time()
-        actions, hidden = script.act(learner["agents"], obs, infos, hidden, 1.0, rng)
-        acting.append(time.process_time() - start)
-        buffer.add(obs, actions, infos["macro_done"], *states)
-        start = time.process_time()
-        obs, rewards, terminations, truncations, infos = env.step(actions)
-        stepping.append(time.process_time() - start)
-        over = terminations | truncations
-        buffer.step(*states, rewards, args.gamma * ~terminations, over, obs, infos)
-        if over.any():
-            obs, infos = env.reset(options={"reset_mask": over})
+    playing, learning = play(script, args, env, learner["agents"], env.horizon, buffer), []
     target, fast = copy.deepcopy(learner).requires_grad_(False), list(learner.parameters())
     optimizer, slow = torch.optim.Adam(fast, fused=True), list(target.parameters())
     mixers = [part["mixer"] for part in (learner, target)] if state else []
@@ -140,8 +133,8 @@ def scale(name, mixer_state, size, updates):
     weights = sum(x.numel() for x in mixers[0].parameters()) if state else 0
     unit = 2**10 if sys.platform == "linux" else 1  # of ru_maxrss, in bytes
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
-    each = [1e6 * np.median(seconds) / env.num_envs for seconds in (stepping, acting)]
-    return *each, 1e3 * np.median(learning), weights / 1e3, sum(x.nbytes for x in memory) / 1e6, peak
+    act, step = 1e6 * np.median(playing, axis=1) / env.num_envs
+    return step, act, 1e3 * np.median(learning), weights / 1e3, sum(x.nbytes for x in memory) / 1e6, peak
 
 
 def print_scaling(updates):
@@ -187,7 +180,12 @@ def main(argv=None):
         usual = script.parse_args([f"--env={env_id}"])
         usual.num_envs = args.num_envs or usual.num_envs
         checkouts = [record.ROOT, args.against] if args.against else [record.ROOT]
-        measures = {} if args.against else acting(script, usual, 5 * args.rounds)
+        measures = {}
+        if not args.against:
+            env = envs.make(env_id, usual.num_envs)
+            agents = script.make_learner(usual, env)["agents"]
+            rounds = np.mean([play(script, usual, env, agents, CALLS) for _ in range(5 * args.rounds)], axis=2)
+            measures = dict(zip(("act", "env"), rounds.T[..., None] / usual.num_envs, strict=True))
         measures |= training(checkouts, name, usual, args.steps, args.rounds)
         for kind, seconds in measures.items():
             row = f"{kind} {name} {env_id} x {usual.num_envs}"
