@@ -86,9 +86,9 @@ class Args:
 DEFAULTS = {
     "bp": dict(discount="decision", learning_starts=150_000, exploration_timesteps=250_000, total_timesteps=600_000,
                td_lambda=0.8, hysteresis=0.1),
-    "wtd-t": dict(total_timesteps=800_000),
+    "wtd-t": dict(total_timesteps=800_000, train_frequency=128),
     "ct": dict(num_envs=128, train_frequency=256, gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8,
-               total_timesteps=600_000, eval_frequency=40_000, eval_episodes=400),
+               total_timesteps=600_000, eval_episodes=400),
 }  # fmt: skip
 
 

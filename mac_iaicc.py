@@ -90,7 +90,7 @@ class Args:
 DEFAULTS = {
     "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000),
     "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, batch_size=32,
-               obs_scale=4.0, reward_scale=1.0, eval_frequency=40_000, eval_episodes=400),
+               obs_scale=4.0, reward_scale=1.0, eval_episodes=400),
 }  # fmt: skip
 
 
