@@ -88,7 +88,9 @@ class Args:
 
 # Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000),
+    "bp": dict(num_envs=4, batch_size=4, gamma=0.98, total_timesteps=600_000, exploration_timesteps=300_000),
+    "wtd-t": dict(num_envs=4, batch_size=4, gamma=0.98, total_timesteps=800_000),
+    "wtd": dict(num_envs=4, batch_size=4, gamma=0.98),
     "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, batch_size=32,
                obs_scale=4.0, reward_scale=1.0, eval_episodes=400),
 }  # fmt: skip

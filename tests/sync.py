@@ -30,6 +30,7 @@ GROUPS = {
     "make_learner": ["avf_vdn dec_maddrqn", "avf_qmix", "avf_qplex", "cen_maddrqn", "mac_iaicc"],
     "Args.__post_init__": [Q_LEARNING, "mac_iaicc"],  # names of settings that the others do not have
     "DEFAULTS.bp": [Q_LEARNING, "mac_iaicc"],
+    "DEFAULTS.wtd-t": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.ct": [Q_LEARNING, "mac_iaicc"],
     **{f"Args.{field}": [Q_LEARNING, "mac_iaicc"] for field in (  # other values, or other words
         "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
