@@ -6,7 +6,7 @@
 Every choice of the greedy episode is replaced by every other one of the agent, alone and with every replacement of a
 later or simultaneous choice of another agent; all other choices stay greedy, by what the agents then observe. Where no
 single replacement brings more, no agent has a reason to change alone; where two do, the team is stuck in a convention.
-A replacement counts as made only if the agent is free then. For tasks without chance.
+A replacement is without effect if, after another, the agent is not free then. For tasks without chance.
 """
 
 import argparse
@@ -43,8 +43,7 @@ class Replacing:
 
     def step(self, actions):
         for episode, agent, action in self.at.get(self.time, ()):
-            if self.env.macro_done[episode, agent]:
-                actions[episode, agent] = action
+            actions[episode, agent] = action  # ignored by the environment if the agent is not free
         self.time += 1
         return self.env.step(actions)
 
