@@ -49,7 +49,7 @@ class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see envs.register
     seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
     total_timesteps: int = 400_000  # environment steps of the run, over all environments
-    num_envs: int = 32  # environments stepped side by side
+    num_envs: int = 4  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
     checkpoint_frequency: float = 60.0  # seconds between checkpoints, from which --resume continues exactly
@@ -61,9 +61,9 @@ class Args:
     # Algorithm
     learning_rate: float = 1e-3  # Adam's step size
     learning_rate_end: float = 0.0  # share of the step size left at total_timesteps, reached linearly
-    gamma: float = 0.95  # discount factor, in [0, 1]
+    gamma: float = 0.98  # discount factor, in [0, 1]
     discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
-    batch_size: int = 8  # episodes that end before an update is made on them
+    batch_size: int = 4  # episodes that end before an update is made on them
     n_step: int = 5  # macro-actions of an agent in its return before its target critic takes over
     polyak: float = 0.95  # share of the target critics kept at each update; higher is slower
     start_e: float = 0.5  # share of uniform macro-actions in the policies at the start
@@ -88,11 +88,10 @@ class Args:
 
 # Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(num_envs=4, batch_size=4, gamma=0.98, total_timesteps=600_000, exploration_timesteps=300_000),
-    "wtd-t": dict(num_envs=4, batch_size=4, gamma=0.98, total_timesteps=800_000),
-    "wtd": dict(num_envs=4, batch_size=4, gamma=0.98),
-    "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, batch_size=32,
-               obs_scale=4.0, reward_scale=1.0, eval_episodes=400),
+    "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000),
+    "wtd-t": dict(total_timesteps=800_000),
+    "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, num_envs=32,
+               batch_size=32, obs_scale=4.0, reward_scale=1.0, eval_episodes=400),
 }  # fmt: skip
 
 

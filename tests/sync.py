@@ -33,7 +33,7 @@ GROUPS = {
     "DEFAULTS.wtd-t": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.ct": [Q_LEARNING, "mac_iaicc"],
     **{f"Args.{field}": [Q_LEARNING, "mac_iaicc"] for field in (  # other values, or other words
-        "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
+        "num_envs", "gamma", "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
 }  # fmt: skip
 
 # Lines of `train` that may differ between any two scripts: what is stored and the loss.

@@ -46,8 +46,8 @@ def test_only_these_definitions_belong_to_one_script():
         "avf_qplex": ["Args.mask_ongoing", "QPLEXMixer"],
         "dec_maddrqn": ["own_loss"],
         "cen_maddrqn": ["Team", "team_batch"],
-        "mac_iaicc": ["Args.entropy_coef", "Args.n_step", "Args.start_e", "DEFAULTS.wtd", "EpisodeBuffer",
-                      "actor_critic_loss", "joint_batch", "soft_policy"],
+        "mac_iaicc": ["Args.entropy_coef", "Args.n_step", "Args.start_e", "EpisodeBuffer", "actor_critic_loss",
+                      "joint_batch", "soft_policy"],
     }  # fmt: skip
     everywhere = set.intersection(*(set(split[script]) for script in SCRIPTS))
     assert {"AgentLinear", "over_rows", "act", "evaluate", "make_learner", "train", "save", "load"} <= everywhere
