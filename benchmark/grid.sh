@@ -22,8 +22,8 @@ python benchmark/sweep.py --seeds 41-50 --workers 2 --record --algos cen_maddrqn
 
 # Figure 8: Mac-IAICC with as much time as AVF-QPLEX, and as many evaluations. With its 4 environments it needs as long a step
 # as AVF-QPLEX, so these are with 32, which step eight times as many at once and learn from 32 episodes. CPU time of training by
-#   python benchmark/speed.py --scripts avf_qplex mac_iaicc --envs bp-30 wtd-t1 --rounds 1 --steps 12000 (mac_iaicc: 100000)
-# with 32 environments, one machine, busy; ratios count. bp-30: AVF-QPLEX 0.34 ms a step where it learns and 0.09 before, 166 s a
+#   python benchmark/speed.py --scripts avf_qplex mac_iaicc --envs bp-30 wtd-t1 --num-envs 32 --rounds 1 --steps 12000 (mac_iaicc: 100000)
+# on one machine, busy; ratios count. bp-30: AVF-QPLEX 0.34 ms a step where it learns and 0.09 before, 166 s a
 # run; Mac-IAICC 0.081 ms, hence 2,000,000 steps. wtd-t1: AVF-QPLEX 1.02 ms with an update per 64 steps, half of it with one
 # per 128, 408 s a run; Mac-IAICC 0.097 ms, hence 4,200,000 steps.
 python benchmark/sweep.py --seeds 41-50 --workers 2 --record --variant same-time --algos mac_iaicc --envs bp-30 -- --num-envs 32 --batch-size 8 --total-timesteps 2000000 --eval-frequency 40000
