@@ -55,7 +55,8 @@ def play(script, args, env, agents, steps, buffer=None):
     rng, seconds = np.random.default_rng(0), np.zeros((2, steps))
     (obs, infos), hidden = env.reset(seed=0), agents.start(env.num_envs)
     for i in range(steps):
-        states, start = (infos["state"],) if hasattr(args, "mixer_state") else (), time.process_time()
+        states = (infos["state"],) if hasattr(args, "mixer_state") else ()  # only mixers see it
+        start = time.process_time()
         actions, hidden = script.act(agents, obs, infos, hidden, 1.0, rng)
         seconds[0, i] = time.process_time() - start
         if buffer:
@@ -115,7 +116,8 @@ def scale(name, mixer_state, size, updates):
     memory = [x for key, x in vars(buffer).items() if key not in ("rows", "queue", "writing")]
     for array in memory:
         array.fill(0)  # a full buffer: what is not written to takes no memory
-    playing, learning = play(script, args, env, learner["agents"], env.horizon, buffer), []
+    playing = play(script, args, env, learner["agents"], env.horizon, buffer)
+    learning = []
     target, fast = copy.deepcopy(learner).requires_grad_(False), list(learner.parameters())
     optimizer, slow = torch.optim.Adam(fast, fused=True), list(target.parameters())
     mixers = [part["mixer"] for part in (learner, target)] if state else []
@@ -184,8 +186,8 @@ def main(argv=None):
         if not args.against:
             env = envs.make(env_id, usual.num_envs)
             agents = script.make_learner(usual, env)["agents"]
-            rounds = np.mean([play(script, usual, env, agents, CALLS) for _ in range(5 * args.rounds)], axis=2)
-            measures = dict(zip(("act", "env"), rounds.T[..., None] / usual.num_envs, strict=True))
+            means = np.mean([play(script, usual, env, agents, CALLS) for _ in range(5 * args.rounds)], axis=2)
+            measures = dict(zip(("act", "env"), means.T[..., None] / usual.num_envs, strict=True))  # [rounds, 1] each
         measures |= training(checkouts, name, usual, args.steps, args.rounds)
         for kind, seconds in measures.items():
             row = f"{kind} {name} {env_id} x {usual.num_envs}"

@@ -5,8 +5,9 @@
 
 Every choice of the greedy episode is replaced by every other one of the agent, alone and with every replacement of a
 later or simultaneous choice of another agent; all other choices stay greedy, by what the agents then observe. Where no
-single replacement brings more, no agent has a reason to change alone; where two do, the team is stuck in a convention.
-A replacement is without effect if, after another, the agent is not free then. For tasks without chance.
+single replacement brings more, no agent has a reason to change alone. A replacement is without effect if, after
+another, the agent is not free then. Discounted: by gamma at every step, even of a run with --discount decision. For
+tasks without chance.
 """
 
 import argparse
@@ -93,8 +94,8 @@ def main(argv=None):
     changes = singles(episode, recorder.n_actions)
     for title, replacements in (("one", [(change,) for change in changes]), ("two", pairs(changes, options.pairs))):
         found = returns(script, args, learner, replacements)
-        more, later = (found > greedy + 1e-6).sum(0)
-        print(f"{title} replaced: {len(found)}, of which higher return {more}, higher discounted return {later}")
+        more, more_discounted = (found > greedy + 1e-6).sum(0)
+        print(f"{title} replaced: {len(found)}, of which higher return {more}, discounted {more_discounted}")
         for best in np.argsort(-found[:, 0], kind="stable")[: options.show]:
             words = (f"t = {t}: {episode.labels[i]} {episode.names[i][m]}" for t, i, m in replacements[best])
             print(f"  return {found[best, 0]:.4g}, discounted {found[best, 1]:.4g}: {'; '.join(words)}")
