@@ -133,19 +133,20 @@ def plot(path, widths, panels, evaluations):
 def draw(ax, runs, evaluations, styles):
     """A panel of learning curves: the mean with standard errors at the steps that all runs have."""
     groups = runs.groupby("label", sort=False)
+    floor, ceiling = runs[["floor", "ceiling"]].iloc[0]
+    lowest = floor - (ceiling - floor) / 2  # early curves may go far down; a band is not drawn without its curve
     for i, (label, of) in enumerate(groups):
         curves = evaluations[evaluations["run"].isin(of.index)].pivot(index="run", columns="step", values="return")
         middle, error = curves.dropna(axis=1).mean(), curves.dropna(axis=1).sem()
         x, every = middle.index / 1000, max(1, len(middle) // 8)
         colour, marker = styles[label]
         marks = dict(marker=marker, ms=4.5, markevery=(i * every // len(groups), every))
-        ax.fill_between(x, middle - error, middle + error, color=colour, alpha=0.15, lw=0, zorder=2)
+        band = dict(where=middle >= lowest, color=colour, alpha=0.15, lw=0, zorder=2)
+        ax.fill_between(x, middle - error, middle + error, **band)
         ax.plot(x, middle, color=colour, lw=1.7, label=label, zorder=3 + len(groups) - i, **marks)
-    floor, ceiling = runs[["floor", "ceiling"]].iloc[0]
     for level, line, label in ((floor, ":", "random policy"), (ceiling, "--", "scripted policy")):
         ax.axhline(level, color="#444444", lw=1.2, ls=line, label=label, zorder=1)
-    # Early curves may go far down: half of the way from random to scripted below random will do
-    bottom = max(ax.get_ylim()[0], floor - (ceiling - floor) / 2)
+    bottom = max(ax.get_ylim()[0], lowest)
     top = max(np.max(line.get_ydata()) for line in ax.lines)
     ax.set_ylim(bottom, top + 0.05 * (top - bottom))
     usual = runs[runs["variant"] == ""]  # a variant may go on for longer
