@@ -49,4 +49,7 @@ python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex -
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs bp-10 bp-20 bp-30 -- --discount step
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs wtd-s wtd-d wtd-t wtd-t1 -- --discount decision
 
+# Dec-MADDRQN without Q(lambda)
+python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos dec_maddrqn --envs wtd-s wtd-d -- --td-lambda 0
+
 python benchmark/report.py
