@@ -54,10 +54,11 @@ def flags_of(algorithm, arguments):
 def checksum(algorithm, env):
     """Of all that a run executes: the script, with the values in force on the task for those it has, and envs/*.py.
 
-    So a value of Args or DEFAULTS that is changed leaves the recorded runs of tasks with another what they are.
+    So a value of Args or DEFAULTS that is changed leaves the recorded runs of tasks that have another what they are.
     """
     values = asdict(load_script(algorithm).parse_args([f"--env={env}"]))
-    script = re.sub(r"^(    \w+: .+?) = .*?(?=  # )", r"\1", (ROOT / f"{algorithm}.py").read_text(), flags=re.M)
+    field = rf"^(    (?:{'|'.join(values)}): .+?) = .*?(?=  # )"  # of Args, no other annotated name
+    script = re.sub(field, r"\1", (ROOT / f"{algorithm}.py").read_text(), flags=re.M)
     script = re.sub(r"^DEFAULTS = \{.*?^\}", repr(values), script, flags=re.S | re.M)
     code = [script.encode(), *(path.read_bytes() for path in sorted((ROOT / "envs").glob("*.py")))]
     return hashlib.sha256(b"".join(code)).hexdigest()[:12]
