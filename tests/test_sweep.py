@@ -488,7 +488,8 @@ def test_a_sweep_on_ray_is_stopped_and_survives_the_loss_of_a_node(place, cluste
     """Of three runs on two nodes the first two are stopped; continued, one of the nodes is killed under its run."""
     options = ["--pause=0.1", "--total-timesteps=20", "--checkpoint-frequency=2", "--writing=1"]
     own = ["--engine", "ray", "--address", cluster.address]
-    arguments, stopped = command(place, *options, seeds="1-3", own=own), "1 signals, stopped at step"
+    arguments = command(place, *options, seeds="1-3", own=own)
+    stopped = "1 signals, stopped at step"
     (place / "hold").touch()  # no machine is too slow: what is to be killed is running until it is
     process = start(place / "benchmark" / "sweep.py", arguments)
     wait_for(lambda: len(started(place)) == 2, process)
