@@ -171,7 +171,7 @@ def test_independent_learners_average_over_the_other(play):
 @pytest.mark.parametrize("game", SETTINGS)
 def test_actors_and_critics_find_the_optimum(play, game):
     """On policy: agent 1's a is best as long as agent 0 sometimes takes a, and then so is a for agent 0."""
-    settings = dict(total_timesteps=15_000, batch_size=16, exploration_timesteps=10_000, learning_rate=2e-3)
+    settings = dict(total_timesteps=5_000, batch_size=16, exploration_timesteps=3_000, learning_rate=4e-3)
     assert play(mac_iaicc, game, reward_scale=0.1, **settings)[0] == 8
 
 
