@@ -70,7 +70,7 @@ class Args:
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
-    td_lambda: float = 0.0  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
+    td_lambda: float = 0.8  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
     hysteresis: float = 1.0  # factor on negative TD errors while exploring, 1 from twice as many steps on; 1: none
     hidden_size: int = 64  # width of the agents' layers
 

@@ -32,7 +32,7 @@ GROUPS = {
     "DEFAULTS.bp": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.wtd-t": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.ct": [Q_LEARNING, "mac_iaicc"],
-    "Args.td_lambda": ["avf_vdn avf_qmix avf_qplex cen_maddrqn", "dec_maddrqn"],  # docs/defaults.md, Warehouse
+    "Args.td_lambda": ["avf_vdn avf_qmix avf_qplex", "dec_maddrqn cen_maddrqn"],  # docs/defaults.md, Warehouse
     **{f"Args.{field}": [Q_LEARNING, "mac_iaicc"] for field in (  # other values, or other words
         "num_envs", "gamma", "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
 }  # fmt: skip
