@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from benchmark import record, sweep
@@ -390,6 +391,7 @@ def test_recorded_runs_are_kept_and_skipped_without_their_folders(place, capsys)
     assert sorted(runs["seed"]) == [1, 2, 3] and list(runs) == record.RUNS
     assert set(runs["checksum"]) == {record.checksum("counter", "bp-10")} and set(runs["steps"]) == {4}
     assert set(runs["flags"]) == set(runs["variant"]) == {""}
+    assert all(text.endswith(f", {torch.backends.cpu.get_cpu_capability()}") for text in runs["processor"])
     one = evaluations[evaluations["seed"] == 2]
     assert list(one["step"]) == [1, 2, 3, 4] and list(one["return"]) == list(one["success"]) == [10, 20, 30, 40]
     shutil.rmtree(place / "runs")
