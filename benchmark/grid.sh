@@ -45,9 +45,9 @@ python benchmark/sweep.py --seeds 41-45 --workers 2 --record --variant paper --a
 # The mask of ongoing agents, without which the mixer breaks Mac-IGM
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs bp-10 wtd-s -- --no-mask-ongoing
 
-# The other discount: gamma^tau on Box Pushing, gamma once a row on the Warehouse
+# The other discount: gamma^tau on Box Pushing, gamma once a row on the others; where all is primitive they are the same
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs bp-10 bp-20 bp-30 -- --discount step
-python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs wtd-s wtd-d wtd-t wtd-t1 -- --discount decision
+python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs wtd-s wtd-d wtd-t wtd-t1 ct-10 -- --discount decision
 
 # The other lambda: Dec-MADDRQN without Q(lambda), AVF with it
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos dec_maddrqn --envs wtd-s wtd-d -- --td-lambda 0

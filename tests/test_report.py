@@ -222,7 +222,7 @@ def test_the_grid_has_the_runs_of_every_panel():
             env, *algorithm = panel.split()
             compared |= {(env, name, "") for name in algorithm or panels["algorithms"]}
             compared |= {(env, *algorithm, variant) for variant in panels["variants"] if algorithm}
-    own_discount = {("bp", "discount=decision"), ("wtd", "discount=step")}  # the defaults
+    own_discount = {("bp", "discount=decision"), ("wtd", "discount=step"), ("ct", "discount=step")}  # the defaults
     assert grid == {run for run in compared if (run[0].split("-")[0], run[2]) not in own_discount}
 
 
