@@ -20,9 +20,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pandas as pd
-import torch
 from tensorboard.backend.event_processing.event_file_loader import LegacyEventFileLoader
 from tensorboard.compat.proto.event_pb2 import SessionLog
+from torch.backends.cpu import get_cpu_capability
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmark" / "results"
@@ -75,7 +75,7 @@ def processor():
     """This machine's processor and its vector instructions as torch uses them: with others it rounds differently."""
     about = Path("/proc/cpuinfo")  # of Linux, and without a name of some processors
     names = re.findall(r"model name\s*: (.*)", about.read_text()) if about.exists() else []
-    return f"{names[0] if names else platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
+    return f"{names[0] if names else platform.processor()}, {get_cpu_capability()}"
 
 
 def replace_text(path, text):
