@@ -230,12 +230,13 @@ def test_mixer_state_feeds_the_rows_it_says(mixer_state):
     assert (got, later) == expected[mixer_state]
 
 
-def test_real_state_is_that_of_the_last_step_of_the_interval():
+@pytest.mark.parametrize(("mixer_state", "times"), [("decision", [0, 4]), ("real", [3, 5])])
+def test_real_state_is_that_of_the_last_step_of_the_interval(mixer_state, times):
     """Agents choose at steps 0 and 4, the episode ends after step 5."""
     buffer = chosen_by_hand({0: (True, True), 4: (True, True)}, 6, gamma=0.5)
-    batch = windows(buffer, [0], [0], 5, "real")
+    batch = windows(buffer, [0], [0], 5, mixer_state)
     assert batch["valid"].sum() == 2
-    assert batch["state"][0, :2, 0].tolist() == [3, 5] and batch["next_state"][0, 1:3, 0].tolist() == [4, 6]
+    assert batch["state"][0, :2, 0].tolist() == times and batch["next_state"][0, 1:3, 0].tolist() == [4, 6]
     assert batch["reward"][0, :2].tolist() == [0 + 0.5 * 1 + 0.25 * 2 + 0.125 * 3, 4 + 0.5 * 5]
     assert batch["discount"][0, :2].tolist() == [0.5**4, 0.5**2]
 
