@@ -231,7 +231,7 @@ def test_mixer_state_feeds_the_rows_it_says(mixer_state):
 
 
 @pytest.mark.parametrize(("mixer_state", "times"), [("decision", [0, 4]), ("real", [3, 5])])
-def test_real_state_is_that_of_the_last_step_of_the_interval(mixer_state, times):
+def test_real_state_is_that_of_the_last_step_and_decision_of_the_first(mixer_state, times):
     """Agents choose at steps 0 and 4, the episode ends after step 5."""
     buffer = chosen_by_hand({0: (True, True), 4: (True, True)}, 6, gamma=0.5)
     batch = windows(buffer, [0], [0], 5, mixer_state)
