@@ -108,8 +108,8 @@ def panels_of(section, runs):
     return panels
 
 
-def plot(path, widths, panels, evaluations):
-    """A PNG of panels, so many in each row, with one legend; those without runs stay empty."""
+def plot(path, widths, panels, evaluations, shares):
+    """A PNG of panels, so many in each row, with one legend; those without runs stay empty. shares: as for `draw`."""
     plt.rcParams.update(PAPER["matplotlib"])
     figure = plt.figure(figsize=(max(9, 3.5 * max(widths)), 1 + 3.2 * len(widths)))
     titles, others = iter(panels), itertools.cycle(PAPER["other styles"])
@@ -122,7 +122,7 @@ def plot(path, widths, panels, evaluations):
         if not len(panels[title]):
             ax.axis("off")
             continue
-        draw(ax, panels[title], evaluations, styles)
+        draw(ax, panels[title], evaluations, styles, shares)
         legend |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     columns = max(1, int(11 * figure.get_figwidth()) // (max(map(len, legend)) + 9))  # as many as fit side by side
     figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns)
@@ -130,15 +130,19 @@ def plot(path, widths, panels, evaluations):
     plt.close(figure)
 
 
-def draw(ax, runs, evaluations, styles):
-    """A panel of learning curves: the mean with standard errors at the steps that all runs have."""
+def draw(ax, runs, evaluations, styles, shares=False):
+    """A panel of learning curves: the mean with standard errors at the steps that all runs have.
+
+    shares: against the share of the run, for runs of different lengths that take the same time.
+    """
     groups = runs.groupby("label", sort=False)
     floor, ceiling = runs[["floor", "ceiling"]].iloc[0]
     lowest = floor - (ceiling - floor) / 2  # early curves may go far down; a band is not drawn without its curve
     for i, (label, of) in enumerate(groups):
         curves = evaluations[evaluations["run"].isin(of.index)].pivot(index="run", columns="step", values="return")
         middle, error = curves.dropna(axis=1).mean(), curves.dropna(axis=1).sem()
-        x, every = middle.index / 1000, max(1, len(middle) // 8)
+        x = middle.index / (middle.index[-1] / 100 if shares else 1000)
+        every = max(1, len(middle) // 8)
         colour, marker = styles[label]
         marks = dict(marker=marker, ms=4.5, markevery=(i * every // len(groups), every))
         band = dict(where=middle >= lowest, color=colour, alpha=0.15, lw=0, zorder=2)
@@ -150,8 +154,9 @@ def draw(ax, runs, evaluations, styles):
     top = max(np.max(line.get_ydata()) for line in ax.lines)
     ax.set_ylim(bottom, top + 0.05 * (top - bottom))
     usual = runs[runs["variant"] == ""]  # a variant may go on for longer
-    ax.set_xlim(0, (usual if len(usual) else runs)["step"].max() / 1000)
-    ax.set(xlabel="environment steps (thousands)", ylabel="return of greedy episodes")
+    ax.set_xlim(0, 100 if shares else (usual if len(usual) else runs)["step"].max() / 1000)
+    x = "share of the run's steps (%)" if shares else "environment steps (thousands)"
+    ax.set(xlabel=x, ylabel="return of greedy episodes")
 
 
 def table(rows):
@@ -219,7 +224,8 @@ def main(argv=None):
                 continue
             shown |= new
             name = title.lower().replace(" ", "-")
-            plot(args.output / f"{name}.png", [len(row) for row in rows], panels, evaluations)
+            widths, shares = [len(row) for row in rows], section.get("shares", False)
+            plot(args.output / f"{name}.png", widths, panels, evaluations, shares)
             text += f"## {title}\n\n{section['about']}\n\n![{title}]({name}.png)\n\n"
             text += tables({panel: of for panel, of in panels.items() if len(of)}, section.get("paper", {}))
         sources = runs.groupby(["algorithm", "variant", "flags", "checksum"], sort=False)

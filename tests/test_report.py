@@ -161,7 +161,7 @@ def test_a_report_by_hand(runs, tmp_path, capsys):
     assert [(row["flags"], row["env"], row["seed"]) for row in sources] == [
         ("", "wtd-s", "1 2 3"), ("mixer_state=single", "wtd-s", "1"),
     ]  # fmt: skip
-    assert "No runs yet: Table 1; Figure 8; Table 3; " in text, "and the others of which nothing is new"
+    assert "No runs yet: Table 1; Figure 8; Figure 8 with as much time; Table 3; " in text, "and the others of which nothing is new"
 
 
 def test_every_run_is_in_a_section_once_it_is_in_none_of_the_papers(tmp_path):
@@ -353,6 +353,11 @@ def test_curves_of_figures_by_hand(tmp_path):
     assert ax.get_xlim() == (0, 600) and lines[labels[1]].get_xdata()[-1] == 900
     band = ax.collections[0].get_paths()[0].vertices[:, 1]
     assert (band.min(), band.max()) == pytest.approx((0.14725, 0.45275), abs=1e-5)
+    ax = Figure().subplots()
+    report.draw(ax, panels["ct-10"], evaluations, dict.fromkeys(labels, ("red", "o")), shares=True)
+    lines = {line.get_label(): line for line in ax.lines}
+    assert ax.get_xlim() == (0, 100) and {lines[label].get_xdata()[-1] for label in labels} == {100}
+    assert lines[labels[1]].get_xdata()[0] == pytest.approx(100 / 9)
 
 
 # The command line
