@@ -217,6 +217,7 @@ def test_the_grid_has_the_runs_of_every_panel():
             args = vars(record.load_script(algorithm).parse_args([f"--env={env}", *flags.split()]))
             grid.add((env, algorithm, *given.get("variant", [record.flags_of(algorithm, args)])))
     compared = {("bp-30", "mac_iaicc", "same-time"), ("wtd-t1", "mac_iaicc", "same-time")}
+    compared |= {("wtd-t1", "mac_iaicc", "same-time-8")}
     for panels in report.PAPER["sections"].values():
         for panel in itertools.chain.from_iterable(panels["panels"]):
             env, *algorithm = panel.split()
