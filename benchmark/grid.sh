@@ -31,7 +31,7 @@ python benchmark/sweep.py --seeds 41-50 --workers 2 --record --variant same-time
 
 # Seen then: on wtd-t1 eight of these ten idle, as exploration ends after 5% of the steps. So, for a fair match, with 8 environments and
 # the default's quarter of the run for exploration, as long a run (191 s for 1,400,000 steps where AVF-QPLEX takes 216 s): seed 101 ends at 714,
-# with 32 environments and that quarter at 310. On bp-30 the default takes longer than AVF-QPLEX already.
+# with 32 environments and that quarter at 310 (commit 5497b29). On bp-30 the default takes longer than AVF-QPLEX already.
 python benchmark/sweep.py --seeds 41-50 --workers 2 --record --variant same-time-8 --algos mac_iaicc --envs wtd-t1 -- --num-envs 8 --total-timesteps 1600000 --exploration-timesteps 400000 --eval-frequency 20000
 
 # Table 3: primitive actions
