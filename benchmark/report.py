@@ -95,16 +95,22 @@ def read_runs(paths):
 def panels_of(section, runs):
     """{title: runs, with a column `label`} of the panels of a section of paper.json.
 
-    A panel is a task, where algorithms are compared, or a task and an algorithm, of which variants are compared.
+    A panel is a task, where algorithms are compared, a task and an algorithm, of which variants are compared, or a
+    task and one of the section's groups, {algorithm: variant}, where algorithms are compared, each as that variant.
     """
     names, panels = PAPER["names"], {}
     variants = section.get("variants") or {variant: f" {variant}".rstrip() for variant in runs["variant"]}
     for panel in itertools.chain.from_iterable(section["panels"]):
-        env, _, algorithm = panel.partition(" ")
-        algorithms = [algorithm] if algorithm else section.get("algorithms", runs["algorithm"])
-        of = runs[(runs["env"] == env) & runs["variant"].isin(variants) & runs["algorithm"].isin(algorithms)]
-        first = "" if algorithm else of["algorithm"].replace(names)
-        panels[f"{env} {names.get(algorithm, '')}".strip()] = of.assign(label=first + of["variant"].map(variants))
+        env, _, kind = panel.partition(" ")
+        on = runs[runs["env"] == env]
+        if group := section.get("groups", {}).get(kind):
+            of = on[on["algorithm"].map(group) == on["variant"]]
+            labels = of["algorithm"].replace(names)
+        else:
+            algorithms = [kind] if kind else section.get("algorithms", runs["algorithm"])
+            of = on[on["variant"].isin(variants) & on["algorithm"].isin(algorithms)]
+            labels = ("" if kind else of["algorithm"].replace(names)) + of["variant"].map(variants)
+        panels[f"{env} {names.get(kind, kind)}".strip()] = of.assign(label=labels)
     return panels
 
 

@@ -221,9 +221,12 @@ def test_the_grid_has_the_runs_of_every_panel():
     compared |= {("wtd-t1", "mac_iaicc", "same-time-8")}
     for panels in report.PAPER["sections"].values():
         for panel in itertools.chain.from_iterable(panels["panels"]):
-            env, *algorithm = panel.split()
-            compared |= {(env, name, "") for name in algorithm or panels["algorithms"]}
-            compared |= {(env, *algorithm, variant) for variant in panels["variants"] if algorithm}
+            env, _, kind = panel.partition(" ")
+            if group := panels.get("groups", {}).get(kind):
+                compared |= {(env, *run) for run in group.items()}
+                continue
+            compared |= {(env, name, "") for name in ([kind] if kind else panels["algorithms"])}
+            compared |= {(env, kind, variant) for variant in panels["variants"] if kind}
     own_discount = {("bp", "discount=decision"), ("wtd", "discount=step"), ("ct", "discount=step")}  # the defaults
     assert grid == {run for run in compared if (run[0].split("-")[0], run[2]) not in own_discount}
 
@@ -321,6 +324,20 @@ def test_figures_show_every_curve(runs, tmp_path):
         for colour in colours:
             rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
             assert (np.abs(pixels - rgb).max(2) < 8).sum() > 200, (name, colour)
+
+
+def test_a_group_compares_a_variant_of_each_algorithm(tmp_path):
+    """Only the variant that the group names: neither the same one of another algorithm nor algorithms without any."""
+    for algorithm in ("avf_qplex", "dec_maddrqn", "avf_vdn"):
+        for started, value in ((1_000, 0.0), (2_000, 0.8)):
+            write_run(tmp_path, algorithm, "wtd-s", 1, rising(10), started=started, td_lambda=value)
+    runs, *_ = report.read_runs([tmp_path])
+    group = {"avf_qplex": "", "dec_maddrqn": "td_lambda=0.0"}  # both are runs with 0
+    panels = report.panels_of({"panels": [["wtd-s one row"]], "groups": {"one row": group}}, runs)
+    found = panels["wtd-s one row"]
+    assert list(zip(found["label"], found["variant"], strict=True)) == [
+        ("AVF-QPLEX", ""), ("Dec-MADDRQN", "td_lambda=0.0"),
+    ]  # fmt: skip
 
 
 def test_figure_4_has_the_papers_layout(tmp_path, monkeypatch):
