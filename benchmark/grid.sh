@@ -54,8 +54,8 @@ python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex -
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs bp-10 bp-20 bp-30 -- --discount step
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex --envs wtd-s wtd-d wtd-t wtd-t1 ct-10 -- --discount decision
 
-# The other lambda: Dec-MADDRQN without Q(lambda), AVF with it
+# The same lambda for all on the Warehouse: 0 for Dec-MADDRQN, 0.8 for AVF
 python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos dec_maddrqn --envs wtd-s wtd-d -- --td-lambda 0
-python benchmark/sweep.py --seeds 41-45 --workers 2 --record --algos avf_qplex avf_qmix avf_vdn --envs wtd-d wtd-t1 -- --td-lambda 0.8
+python benchmark/sweep.py --seeds 41-50 --workers 2 --record --algos avf_qplex avf_qmix avf_vdn --envs wtd-s wtd-d wtd-t wtd-t1 -- --td-lambda 0.8
 
 python benchmark/report.py
