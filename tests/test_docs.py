@@ -62,6 +62,14 @@ def test_the_names_in_how_it_works_are_in_the_code(page):
             assert re.search(rf"\b{name}\b", code), name
 
 
+def test_the_verdicts_in_short_are_those_of_the_claims():
+    text = (DOCS / "claims.md").read_text()
+    short = dict(re.findall(r"^\| (C\d+[a-z]?) \| .* \| (.*) \|$", text, re.M))
+    parts = re.split(r"^\*\*(C\d+[a-z]?)\.", text, flags=re.M)[1:]  # name, section, name, section, ...
+    told = [re.search(r"Verdict:\s+\*\*(.*?)\*\*", section)[1] for section in parts[1::2]]
+    assert short == dict(zip(parts[::2], told, strict=True))
+
+
 def test_differences():
     assert not differences("a 1.234  -0.000 b 7\n", "a   1.235 0.000  b 7\n")
     assert differences("1.234", "1.236") and differences("7", "8") and differences("row 1.2", "now 1.2")
