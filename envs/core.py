@@ -27,10 +27,14 @@ class MacroVectorEnv(VectorEnv, ABC):
         macro_action_names: for each agent the names of its macro-actions.
         macro_done: bool [N, n], True where the agent is free, that is, will start what the next step gives it.
         macro_action: int64 [N, n], the macro-action running or last run, -1 before the first.
+        own_actions: bool [n, A], which of the widest agent's A macro-actions each agent has.
+        available: bool [N, n, A], what each agent can do next. An agent that is free can start the macro-actions of its
+            initiation set. An agent that is busy can only go on with the macro-action it runs.
         elapsed: int64 [N], steps taken in the episode. episode_return: float64 [N], its undiscounted return so far.
 
-    A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`; it names
-    the arrays that hold its simulator state in `sim_arrays`, the first axis of each being the environment.
+    A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`. If its
+    macro-actions have initiation sets, it overrides `_can_start`. It names the arrays that hold its simulator state in
+    `sim_arrays`; the first axis of each is the environment.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8, "autoreset_mode": AutoresetMode.DISABLED}
@@ -58,12 +62,13 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.single_action_space = gym.spaces.MultiDiscrete(self.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._action_limit = np.array(self.n_actions)
+        self.own_actions = np.arange(max(self.n_actions)) < np.array(self.n_actions)[:, None]
 
         agents = (num_envs, self.n_agents)
         self.macro_done, self.macro_action = np.ones(agents, bool), np.full(agents, -1)
         self.elapsed, self.episode_return = np.zeros(num_envs, np.int64), np.zeros(num_envs)
         self.over, self.success = np.ones(num_envs, bool), np.zeros(num_envs, bool)
+        self.available = np.tile(self.own_actions, (num_envs, 1, 1))
         self._obs = np.zeros((num_envs, *self.single_observation_space.shape), np.float32)
 
     # ---- what a domain implements -------------------------------------------------------------------------------
@@ -87,6 +92,13 @@ class MacroVectorEnv(VectorEnv, ABC):
     @abstractmethod
     def _state(self):
         """The true state, a new float32 array [N, S]."""
+
+    def _can_start(self):
+        """Initiation sets, bool [N, n, A]: what each agent could start now if it is free. By default all that it has.
+
+        Each free agent needs at least one macro-action that it can start.
+        """
+        return np.broadcast_to(self.own_actions, self.available.shape)
 
     @abstractmethod
     def _draw(self, index):
@@ -118,6 +130,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.elapsed[mask], self.episode_return[mask] = 0, 0.0
         self.over[mask], self.success[mask] = False, False
         self._obs[mask] = self._observe(start=True)[mask]
+        self._update_available()
         return self._obs.copy(), self._infos()
 
     def step(self, actions):
@@ -129,11 +142,12 @@ class MacroVectorEnv(VectorEnv, ABC):
         Returns:
             obs float32 [N, n, d], rewards float64 [N], terminations bool [N], truncations bool [N] and infos:
             `macro_done` bool [N, n] (the agent's macro-action ended in this step: it chooses next), `macro_action`
-            int64 [N, n] (the one that ran), `state` float32 [N, S], `success` bool [N] (the task's goal was reached).
+            int64 [N, n] (the one that ran), `available` bool [N, n, A] (what the agent can do next), `state` float32
+            [N, S], `success` bool [N] (the task's goal was reached).
 
         Raises:
             ValueError: the array has another shape or is not of integers, an environment's episode has ended, or a free
-                agent's action is out of range.
+                agent's macro-action is out of range or not in its initiation set.
         """
         actions = np.asarray(actions)
         if actions.shape != self.macro_done.shape or actions.dtype.kind not in "iu":
@@ -145,13 +159,7 @@ class MacroVectorEnv(VectorEnv, ABC):
                 f"environments {np.flatnonzero(self.over)[:10].tolist()} have ended (or were never reset): "
                 "reset them first, with options={'reset_mask': terminations | truncations}"
             )
-        bad = self.macro_done & ((actions < 0) | (actions >= self._action_limit))
-        if bad.any():
-            env, agent = np.argwhere(bad)[0]
-            raise ValueError(
-                f"agent {agent} of environment {env} was given macro-action {actions[env, agent]}: "
-                f"it has 0..{self.n_actions[agent] - 1}"
-            )
+        self._check_free_agents(actions)
         np.copyto(self.macro_action, actions, where=self.macro_done, casting="unsafe")
         self.elapsed += 1
         rewards, terminations, ended, success = self._advance()
@@ -161,6 +169,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.macro_done = ended | self.over[:, None]
         self.episode_return += rewards
         np.copyto(self._obs, self._observe(start=False), where=self.macro_done[:, :, None])
+        self._update_available()
         return self._obs.copy(), rewards, terminations, truncations, self._infos()
 
     def render(self):
@@ -169,10 +178,36 @@ class MacroVectorEnv(VectorEnv, ABC):
             return None
         return tuple(self._draw(index) for index in range(self.num_envs))
 
+    def _check_free_agents(self, actions):
+        """Raises ValueError for the first free agent that is given a macro-action which it cannot start."""
+        in_range = (actions >= 0) & (actions < self.own_actions.shape[1])
+        known = np.where(in_range, actions, 0)
+        startable = in_range & np.take_along_axis(self.available, known[..., None], axis=2)[..., 0]
+        bad = self.macro_done & ~startable
+        if bad.any():
+            env, agent = np.argwhere(bad)[0]
+            given, count = actions[env, agent], self.n_actions[agent]
+            problem = f"it has 0..{count - 1}"
+            if 0 <= given < count:
+                can_start = np.flatnonzero(self.available[env, agent]).tolist()
+                problem = f"{self.macro_action_names[agent][given]} is not available, it can start {can_start}"
+            raise ValueError(f"agent {agent} of environment {env} was given macro-action {given}: {problem}")
+
+    def _update_available(self):
+        """Sets `available`: the initiation set of a free agent, only the running macro-action of a busy one."""
+        can_start = self._can_start() & self.own_actions
+        stuck = self.macro_done & ~can_start.any(axis=2)
+        if stuck.any():
+            env, agent = np.argwhere(stuck)[0]
+            raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
+        running = self.macro_action[..., None] == np.arange(self.own_actions.shape[1])
+        self.available = np.where(self.macro_done[..., None], can_start, running)
+
     def _infos(self):
         return {
             "macro_done": self.macro_done.copy(),
             "macro_action": self.macro_action.copy(),
+            "available": self.available.copy(),
             "state": self._state(),
             "success": self.success.copy(),
         }
@@ -199,6 +234,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         for name in self._checkpointed():
             setattr(self, name, np.asarray(saved[name]).copy())
         self.np_random.bit_generator.state = saved["np_random"]
+        self._update_available()
         return self._obs.copy(), self._infos()
 
 
