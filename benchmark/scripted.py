@@ -91,8 +91,7 @@ def deliver(env, rng, loads):
     passes = (staged > 0) & np.take_along_axis(waits, receiver[:, None], 1)[:, 0]
     searches = (found < len(tool)) & (staged < capacity)
     task = np.where(searches, 1 + env.n_robots + tool.take(found, mode="clip"), 0)
-    task = np.where(passes, 1 + receiver, task)
-    actions[:, -1] = np.where(env.arm_left > 0, env.arm_task, task)  # primitive: do not give up what was begun
+    actions[:, -1] = np.where(passes, 1 + receiver, task)
     return actions
 
 

@@ -3,6 +3,22 @@
 import numpy as np
 
 
+def shown(value):
+    """The value as Python writes it, on one line: an array's own way takes several."""
+    return " ".join(repr(value).split())
+
+
+def flag(name, value):
+    """True or False as a bool.
+
+    Raises:
+        ValueError: the value is anything else. So the string "False" does not count as true.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, got {shown(value)}")
+    return bool(value)
+
+
 def numbers(name, value, shape=(), low=-np.inf, high=np.inf):
     """A finite number as a float, or an array float64 of that shape.
 
@@ -22,7 +38,7 @@ def numbers(name, value, shape=(), low=-np.inf, high=np.inf):
         what = f"finite numbers of shape {shape}" if shape else "a finite number"
         if (low, high) != (-np.inf, np.inf):
             what += f" from {low:g} to {high:g}" if high < np.inf else f" of at least {low:g}"
-        raise ValueError(f"{name} must be {what}, got {value!r}")
+        raise ValueError(f"{name} must be {what}, got {shown(value)}")
     return array.astype(np.float64) if shape else float(array)
 
 
@@ -30,7 +46,7 @@ def whole(name, value, shape=(), low=1, high=np.inf):
     """A whole number as an int, or an array int64 of that shape; arguments and errors as of `numbers`."""
     number = numbers(name, value, shape, low, high)
     if np.any(np.mod(number, 1) != 0):
-        raise ValueError(f"{name} must be whole, got {value!r}")
+        raise ValueError(f"{name} must be whole, got {shown(value)}")
     return number.astype(np.int64) if shape else int(number)
 
 
@@ -38,7 +54,7 @@ def rows(name, value, width):
     """An array float64 [at least one row, width]; errors as of `numbers`."""
     count = len(value) if np.iterable(value) and hasattr(value, "__len__") else 0
     if count == 0:
-        raise ValueError(f"{name} must be a list with at least one entry, got {value!r}")
+        raise ValueError(f"{name} must be a list with at least one entry, got {shown(value)}")
     return numbers(name, value, (count, width))
 
 
@@ -46,5 +62,5 @@ def positive(name, value, shape=()):
     """Like `numbers`, but all must be above 0."""
     number = numbers(name, value, shape)
     if np.any(np.asarray(number) <= 0):
-        raise ValueError(f"{name} must be above 0, got {value!r}")
+        raise ValueError(f"{name} must be above 0, got {shown(value)}")
     return number

@@ -1,5 +1,6 @@
 """The step contract shared by every domain: batched macro-action environments and their single-environment view."""
 
+import json
 from abc import ABC, abstractmethod
 
 import gymnasium as gym
@@ -218,9 +219,10 @@ class MacroVectorEnv(VectorEnv, ABC):
         return base + self.sim_arrays
 
     def save_state(self):
-        """The whole simulator: a dict of array copies and, under "np_random", the generator's state."""
+        """The whole simulator, a dict of arrays. "np_random" is the generator's state, as the bytes of its JSON."""
         arrays = {name: getattr(self, name).copy() for name in self._checkpointed()}
-        return arrays | {"np_random": self.np_random.bit_generator.state}
+        generator = json.dumps(self.np_random.bit_generator.state)
+        return arrays | {"np_random": np.frombuffer(generator.encode(), np.uint8).copy()}
 
     def load_state(self, saved):
         """Continues from what `save_state` returned; returns obs and infos as the last reset or step did.
@@ -233,7 +235,7 @@ class MacroVectorEnv(VectorEnv, ABC):
                 raise ValueError(f"the saved state is of another environment: {name!r} is missing or of another shape")
         for name in self._checkpointed():
             setattr(self, name, np.asarray(saved[name]).copy())
-        self.np_random.bit_generator.state = saved["np_random"]
+        self.np_random.bit_generator.state = json.loads(bytes(np.asarray(saved["np_random"])))
         self._update_available()
         return self._obs.copy(), self._infos()
 

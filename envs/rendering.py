@@ -274,11 +274,11 @@ def _robot_note(env, index, robot):
     """The direction in which a robot moves, (dx, dy) or None, and in words how far it is or where."""
     position, running = env.position[index, robot], not env.macro_done[index, robot]
     to_go = env.waypoints[robot, env.macro_action[index, robot]] - position
-    distance, location, waited = hypot(*to_go), env.location[index, robot], -env.time_left[index, robot]
+    distance, location, waited = hypot(*to_go), env.location[index, robot], env.waited[index, robot]
     if running and distance > 0:
         return (to_go[0] / distance, -to_go[1] / distance), f"{distance:.1f} m to go"
     places = [*(f"at workshop {human}" for human in range(env.n_humans)), "in the tool room", "at the table"]
-    if location == len(places) or (position != env.waypoints[robot, location]).any():  # location is the last waypoint
+    if location == env.nowhere_yet or env.under_way[index, robot]:
         return None, "at no waypoint"
     waits = places[location] == "at the table" and waited > 0 and (running or env.primitive)
     return None, f"waits for a tool, {waited} of {env.tool_wait_steps}" if waits else places[location]
@@ -310,7 +310,7 @@ def _workshop(canvas, env, index, human):
 
 def _arm(canvas, env, index):
     """The arm at the origin: what it is doing and for how long, what its hand holds, and the staged tools."""
-    task, steps_left, staged = env.arm_task[index], env.arm_left[index], env.staged[index]
+    task, steps_left, staged = env.macro_action[index, -1], env.arm_left[index], env.staged[index]
     passes, searches = steps_left > 0 and 1 <= task <= env.n_robots, steps_left > 0 and task > env.n_robots
     ready = passes and env.pass_ready[index]
     holds = ready and staged[0] >= 0

@@ -1,15 +1,17 @@
 """Warehouse Tool Delivery: mobile robots fetch tools from an arm and bring them to human workers, just in time."""
 
-import itertools
-
 import numpy as np
 
+from envs import checks
 from envs.core import MacroVectorEnv
 
-TOOLS, PHASES = 3, 4
-MAX_CAPACITY = 6  # the staging queue is looked up in a table of 4 ** capacity rows
+TOOLS = 3  # kinds of tools
+PHASES = 4  # of a human's work: tool k is needed for phase k + 1
+LAST_PHASE = PHASES - 1
+NO_TOOL = -1  # an empty place in the staging queue
 
-# Positions in metres; one entry per human in workshops and phase_lengths, one per robot in tables and starts.
+# Positions are in metres. There is one entry per human in `workshops` and `phase_lengths`, and one per robot in
+# `tables` and `starts`. `arm` is only drawn.
 LAYOUTS = {
     "s": {
         "workshops": [(6.0, 3.0)],
@@ -29,7 +31,7 @@ LAYOUTS = {
         "arm": (0.9, 2.5),
         "robot_speed": 0.8,
         "copies": 2,
-        "phase_lengths": [(27, 20, 20, 20), (27, 20, 20, 20)],
+        "phase_lengths": [(27, 20, 20, 20)] * 2,
     },
     "t": {
         "workshops": [(6.0, 3.0), (8.0, 3.0), (8.0, 2.0)],
@@ -39,7 +41,7 @@ LAYOUTS = {
         "arm": (0.9, 2.5),
         "robot_speed": 0.8,
         "copies": 3,
-        "phase_lengths": [(40, 40, 40, 40), (40, 40, 40, 40), (40, 40, 40, 40)],
+        "phase_lengths": [(40, 40, 40, 40)] * 3,
     },
     "t1": {
         "workshops": [(6.0, 3.0), (8.0, 3.0), (8.0, 2.0)],
@@ -54,34 +56,46 @@ LAYOUTS = {
 }
 
 
+def one_hot(numbers, size):
+    """Bool [..., size], True at each number and all False for a number out of range."""
+    return numbers[..., None] == np.arange(size)
+
+
 class Warehouse(MacroVectorEnv):
     """Warehouse Tool Delivery (WTD), a batch of N environments.
 
     ## Description
-    Each of H human workers, one to a workshop, works through four phases. It starts with the tool for the first phase
-    and needs tools 0, 1 and 2, in that order, for the other three. An arm finds the tools, stages them beside its table
-    and passes the oldest staged one to a robot that waits there; R mobile robots take them to the workshops. The team
-    should bring every tool before its human has to wait for it.
+    Each of H human workers has a workshop and works through four phases. A human starts with the tool for the first
+    phase. It needs tools 0, 1 and 2, in that order, for the other three. An arm finds the tools and stages them beside
+    its table. It passes the oldest staged tool to a robot that waits at the table. R mobile robots take the tools to
+    the workshops. The team should bring every tool before its human has to wait for it.
 
-    Layouts (`LAYOUTS`): "s" 2 robots and 1 human, "d" 2 and 2, "t" 2 and 3, "t1" 3 and 3.
+    There are four layouts (`LAYOUTS`): "s" has 2 robots and 1 human, "d" 2 and 2, "t" 2 and 3, "t1" 3 and 3.
     Agents are ordered robots first, arm last. Everything is deterministic.
 
     ## Macro-actions
-    A robot has H + 2:
+    A robot has H + 2 macro-actions:
 
-    - 0..H-1: Go-W(i), go to workshop i and, once there, give human i its next tool if the robot carries it
-    - H: Go-TR, go to the tool room
-    - H+1: Get-Tool, go to the robot's own place at the table and wait there for a tool, for 10 steps at most
+    - 0..H-1: Go-W(i). The robot goes to workshop i. There it gives human i its next tool if it carries that tool.
+    - H: Go-TR. The robot goes to the tool room.
+    - H+1: Get-Tool. The robot goes to its own place at the table and waits there for a tool, for 10 steps at most.
 
-    A robot moves `robot_speed` a step, straight to its waypoint. The arm has 1 + R + 3:
+    A robot moves `robot_speed` a step, straight to the waypoint of its macro-action, and stands exactly on it at the
+    end. Get-Tool waits from the step after the robot's arrival on. Where the way takes a single step, that step already
+    counts as waiting.
 
-    - 0: Wait-M, 1 step
-    - 1..R: Pass-to-M(j), 4 steps: at its end the oldest staged tool goes to robot j, which ends that robot's Get-Tool
-      (also when nothing is staged). It fails if robot j is not waiting at the table when it begins, or when it ends
-    - R+1..R+3: Search-Tool(k), 6 steps: at its end a copy of tool k is staged, if one is left and there is room for it
+    The arm has 1 + R + 3 macro-actions:
 
-    With `primitive=True` every macro-action ends after one step: a robot moves one step and is asked again, Search and
-    Pass advance by one step and begin anew when the arm was given anything else in between.
+    - 0: Wait-M takes 1 step and does nothing.
+    - 1..R: Pass-to-M(j) takes 4 steps. At its end robot j gets the oldest staged tool, and its Get-Tool ends. (The
+      Get-Tool ends also when nothing is staged.) The Pass fails if robot j is not waiting at the table when the Pass
+      begins or when it ends.
+    - R+1..R+3: Search-Tool(k) takes 6 steps. At its end a copy of tool k is staged if a copy is left to be found and
+      there is room for it.
+
+    With `primitive=True` every macro-action ends after one step and has its effect in this step. A robot moves one step
+    (or waits one step, or delivers) and is asked again. Search finds its tool in one step and Pass hands it over in one
+    step.
 
     ## Macro-observations
     A robot observes H + 3 + 4H + 3 + C numbers (C is the staging capacity, 2):
@@ -91,17 +105,21 @@ class Warehouse(MacroVectorEnv):
     - how many of each of the three tools it carries
     - the number of staged tools, one-hot over 1..C, shown only in the tool room, at the table and "nowhere yet"
 
-    The arm observes 3 + R numbers: how many of each tool are staged, and for each robot whether it stands at its table
-    place. At reset a robot observes only "nowhere yet" and the arm zeros.
+    The arm observes 3 + R numbers:
+
+    - how many of each of the three tools are staged
+    - for each robot whether it stands at its table place
+
+    At a reset a robot observes only "nowhere yet", and the arm observes zeros.
 
     ## Rewards
     - -1 each step
-    - +100 for a tool delivered, or +80 if its human's phase clock has already run down
+    - +100 for each tool delivered, or +80 if its human's phase clock has already run down
     - -10 for a failed Pass
 
     ## Episode end
-    - Termination: every human has got the tool for its fourth phase; those that got it before the last one may
-      meanwhile have gone on to that phase, or finished it. This is also `success`.
+    - Termination: every human has got the tool for its fourth phase. A human that got it early may already have begun
+      that phase, or finished it. Termination is also `success`.
     - Truncation: after `horizon` steps.
 
     ## State
@@ -119,31 +137,48 @@ class Warehouse(MacroVectorEnv):
     ## Arguments
     - layout: a key of `LAYOUTS`. Each of its entries can be replaced by the keyword of the same name, and all of them
       together are a new layout: `workshops` [H, 2], `tool_room` [2], `tables` [R, 2], `starts` [R, 2], `arm` [2] (only
-      drawn), `robot_speed` (metres per step), `copies` (of each tool, an int or three), `phase_lengths` [H, 4] (steps)
-    - primitive: every macro-action ends after one step; horizon: steps until truncation
+      drawn), `robot_speed` (metres per step), `copies` (of each tool, one number or three), `phase_lengths` [H, 4]
+      (steps)
+    - primitive: every macro-action takes one step
+    - horizon: steps until truncation
+    - render_mode: None or "rgb_array"
     - delivery_reward, late_penalty (what a late delivery loses of it), failed_pass_penalty, step_cost: given as
       positive numbers
-    - search_steps, pass_steps, arm_wait_steps: durations of the arm's macro-actions; tool_wait_steps: how long Get-Tool
-      waits at the table
-    - staging_capacity: 1 to 6 tools; room_size: width and depth in metres, by which the state divides positions
+    - search_steps, pass_steps, arm_wait_steps: how long the arm's macro-actions take, 6, 4 and 1 by default. With
+      `primitive=True` they are 1, and any other number is an error.
+    - tool_wait_steps: how long Get-Tool waits at the table
+    - staging_capacity: how many tools can be staged at once
+    - room_size: width and depth in metres, by which the state divides positions
 
     ## Attributes
-    Besides those of `MacroVectorEnv`: the arguments, lists as arrays; n_humans H, n_robots R; waypoints [R, H + 2, 2],
-    by robot and macro-action; and the simulator's state:
+    Besides those of `MacroVectorEnv`:
 
-    - position float64 [N, R, 2]; location int [N, R], the last waypoint reached: 0..H-1 workshops, H tool room,
-      H+1 table, H+2 nowhere yet; carried int [N, R, 3], copies of each tool
-    - time_left int [N, R]: 1 on the way, 0 on arrival or when a tool was handed over, -k after k steps of waiting at
-      the table, -1 after a wait in vain
-    - staged int [N, C], queue of tools, oldest first, -1 empty; found int [N, 3], copies found so far
-    - arm_task int [N], the arm's macro-action, -1 before its first; arm_left int [N], steps left of it; pass_ready
-      bool [N], whether the robot was waiting when the Pass began
-    - phase int [N, H], 0..3; clock int [N, H], steps left of the phase, <= 0 while the human waits for its tool (or, in
-      the fourth phase, has finished); has_next_tool bool [N, H]
+    - the arguments, lists as arrays; n_humans H and n_robots R
+    - the numbers of places: 0..H-1 workshops, tool_room_place H, table_place H+1, nowhere_yet H+2. A robot's
+      macro-action has the number of the place to which it goes.
+    - waypoints float64 [R, H + 2, 2], where these places are, for each robot
+    - task_steps int [1 + R + 3], how long each of the arm's macro-actions takes
+
+    The simulator's state is in these arrays:
+
+    - position float64 [N, R, 2]
+    - location int [N, R], the last place reached
+    - under_way bool [N, R], whether the robot moved in the last step without reaching its waypoint
+    - waited int [N, R], steps of waiting at the table. The count is 0 again when a Pass serves the robot or when the
+      robot is under way. The last step of a wait in vain counts as the first step of the next wait.
+    - carried int [N, R, 3], copies of each tool
+    - staged int [N, C], queue of tools, oldest first, -1 for an empty place
+    - found int [N, 3], copies found so far
+    - arm_left int [N], steps left of the arm's macro-action
+    - pass_ready bool [N], whether the arm runs, or last ran, a Pass whose robot was waiting when it began
+    - phase int [N, H], 0..3
+    - clock int [N, H], steps left of the phase, <= 0 while the human waits for its tool or, in the fourth phase, has
+      finished
+    - has_next_tool bool [N, H], whether the human has the tool for its next phase (always so in the fourth)
 
     ## Irregularities of the published code that are not kept
     The paper states one rule for all rooms. In the published single room Get-Tool waits 11 steps and a delivery counts
-    as late one step later; in the published four-agent room the arm does not check robot 2 at the start of a Pass.
+    as late one step later. In the published four-agent room the arm does not check robot 2 at the start of a Pass.
 
     ## Source
     Y. Xiao, J. Hoffman, T. Xia, C. Amato, "Learning Multi-Robot Decentralized Macro-Action-Based Policies via a
@@ -153,8 +188,18 @@ class Warehouse(MacroVectorEnv):
     """
 
     sim_arrays = (
-        *("position", "location", "carried", "time_left", "staged", "found"),
-        *("arm_task", "arm_left", "pass_ready", "phase", "clock", "has_next_tool"),
+        "position",
+        "location",
+        "under_way",
+        "waited",
+        "carried",
+        "staged",
+        "found",
+        "arm_left",
+        "pass_ready",
+        "phase",
+        "clock",
+        "has_next_tool",
     )
 
     def __init__(
@@ -178,9 +223,9 @@ class Warehouse(MacroVectorEnv):
         late_penalty=20.0,
         failed_pass_penalty=10.0,
         step_cost=1.0,
-        search_steps=6,
-        pass_steps=4,
-        arm_wait_steps=1,
+        search_steps=None,
+        pass_steps=None,
+        arm_wait_steps=None,
         tool_wait_steps=10,
         staging_capacity=2,
     ):
@@ -188,273 +233,299 @@ class Warehouse(MacroVectorEnv):
         if layout not in list(LAYOUTS):
             raise ValueError(f"unknown layout {layout!r}; valid layouts: {' '.join(LAYOUTS)}")
 
+        self.layout = layout
+        self.primitive = checks.flag("primitive", primitive)
+
         def given(name, value):
+            """The keyword's value or, if it was not given, that of the layout."""
             return LAYOUTS[layout][name] if value is None else value
 
-        self.layout, self.primitive = layout, primitive
-        self.workshops = _rows("workshops", given("workshops", workshops), 2)
-        self.tables = _rows("tables", given("tables", tables), 2)
-        self.starts = _rows("starts", given("starts", starts), 2)
-        lengths = _rows("phase_lengths", given("phase_lengths", phase_lengths), PHASES)
-        self.phase_lengths = _whole("phase_lengths", lengths, lengths.shape)
-        self.tool_room = _numbers("tool_room", given("tool_room", tool_room), (2,))
-        self.arm = _numbers("arm", given("arm", arm), (2,))
-        self.room_size = _numbers("room_size", room_size, (2,), positive=True)
-        self.robot_speed = float(_numbers("robot_speed", given("robot_speed", robot_speed), (), positive=True))
-        self.n_humans, self.n_robots = humans, robots = len(self.workshops), len(self.tables)
-        if len(self.starts) != robots:
-            raise ValueError(f"tables and starts need one entry per robot, got {robots} and {len(self.starts)}")
-        if len(lengths) != humans:
-            raise ValueError(f"workshops and phase_lengths need one entry per human, got {humans} and {len(lengths)}")
+        def duration(name, value, usual):
+            """Steps that a macro-action of the arm takes."""
+            if value is None:
+                return 1 if self.primitive else usual
+            steps = checks.whole(name, value)
+            if self.primitive and steps != 1:
+                raise ValueError(f"{name} must be 1 with primitive=True, got {steps}")
+            return steps
+
+        self.workshops = checks.rows("workshops", given("workshops", workshops), 2)
+        self.tool_room = checks.numbers("tool_room", given("tool_room", tool_room), (2,))
+        self.tables = checks.rows("tables", given("tables", tables), 2)
+        self.starts = checks.rows("starts", given("starts", starts), 2)
+        self.arm = checks.numbers("arm", given("arm", arm), (2,))
+        self.robot_speed = checks.positive("robot_speed", given("robot_speed", robot_speed))
         copies = given("copies", copies)
-        self.copies = _whole("copies", copies if hasattr(copies, "__len__") else [copies] * TOOLS, (TOOLS,))
-        self.search_steps = int(_whole("search_steps", search_steps))
-        self.pass_steps = int(_whole("pass_steps", pass_steps))
-        self.arm_wait_steps = int(_whole("arm_wait_steps", arm_wait_steps))
-        self.tool_wait_steps = int(_whole("tool_wait_steps", tool_wait_steps))
-        self.staging_capacity = capacity = int(_whole("staging_capacity", staging_capacity))
-        if capacity > MAX_CAPACITY:
-            raise ValueError(f"staging_capacity must be at most {MAX_CAPACITY}, got {capacity}")
-        self.delivery_reward = float(_numbers("delivery_reward", delivery_reward))
-        self.late_penalty = float(_numbers("late_penalty", late_penalty))
-        self.failed_pass_penalty = float(_numbers("failed_pass_penalty", failed_pass_penalty))
-        self.step_cost = float(_numbers("step_cost", step_cost))
+        self.copies = checks.whole("copies", copies if np.iterable(copies) else [copies] * TOOLS, (TOOLS,))
+        lengths = given("phase_lengths", phase_lengths)
+        shape = checks.rows("phase_lengths", lengths, PHASES).shape
+        self.phase_lengths = checks.whole("phase_lengths", lengths, shape)
+        self.room_size = checks.positive("room_size", room_size, (2,))
+        self.delivery_reward = checks.numbers("delivery_reward", delivery_reward)
+        self.late_penalty = checks.numbers("late_penalty", late_penalty)
+        self.failed_pass_penalty = checks.numbers("failed_pass_penalty", failed_pass_penalty)
+        self.step_cost = checks.numbers("step_cost", step_cost)
+        self.search_steps = duration("search_steps", search_steps, 6)
+        self.pass_steps = duration("pass_steps", pass_steps, 4)
+        self.arm_wait_steps = duration("arm_wait_steps", arm_wait_steps, 1)
+        self.tool_wait_steps = checks.whole("tool_wait_steps", tool_wait_steps)
+        self.staging_capacity = checks.whole("staging_capacity", staging_capacity)
 
-        workshop_names, robot_names = range(humans), range(robots)
-        moves = [*(f"Go-W({i})" for i in workshop_names), "Go-TR", "Get-Tool"]
-        tasks = ["Wait-M", *(f"Pass-to-M({j})" for j in robot_names), *(f"Search-Tool({k})" for k in range(TOOLS))]
-        robot_size, arm_size = (humans + 3) + PHASES * humans + TOOLS + capacity, TOOLS + robots
-        high = np.ones((robots + 1, max(robot_size, arm_size)))
-        high[:-1, robot_size - TOOLS - capacity : robot_size - capacity] = self.copies
-        high[-1, :TOOLS] = np.minimum(self.copies, capacity)
-        state_size = (2 + TOOLS) * robots + 3 * TOOLS + 1 + len(tasks) + (PHASES + 2) * humans
+        humans = len(self.workshops)
+        robots = len(self.tables)
+        if len(self.starts) != robots:
+            got = f"got {robots} and {len(self.starts)}"
+            raise ValueError(f"tables and starts need one entry per robot, {got}")
+        if len(self.phase_lengths) != humans:
+            got = f"got {humans} and {len(self.phase_lengths)}"
+            raise ValueError(f"workshops and phase_lengths need one entry per human, {got}")
+        self.n_humans = humans
+        self.n_robots = robots
+
+        # The robots' waypoints and macro-actions have the same numbers.
+        self.tool_room_place = humans
+        self.table_place = humans + 1
+        self.nowhere_yet = humans + 2
+        shared_waypoints = np.vstack([self.workshops, self.tool_room])
+        self.waypoints = np.stack([np.vstack([shared_waypoints, table]) for table in self.tables])
+        go_names = [f"Go-W({human})" for human in range(humans)]
+        robot_names = [*go_names, "Go-TR", "Get-Tool"]
+
+        # The arm's macro-actions and how long they take.
+        durations = [self.arm_wait_steps] + [self.pass_steps] * robots + [self.search_steps] * TOOLS
+        self.task_steps = np.array(durations)
+        pass_names = [f"Pass-to-M({robot})" for robot in range(robots)]
+        search_names = [f"Search-Tool({tool})" for tool in range(TOOLS)]
+        arm_names = ["Wait-M", *pass_names, *search_names]
+
+        # The upper bounds of the observations and the length of the state, in the order of the class docstring.
+        place_and_phases = np.ones(humans + 3 + PHASES * humans)
+        robot_high = np.concatenate([place_and_phases, self.copies, np.ones(self.staging_capacity)])
+        arm_high = np.concatenate([np.minimum(self.copies, self.staging_capacity), np.ones(robots)])
+        obs_high = np.ones((robots + 1, max(len(robot_high), len(arm_high))))
+        obs_high[:-1, : len(robot_high)] = robot_high
+        obs_high[-1, : len(arm_high)] = arm_high
+        robots_size = robots * (2 + TOOLS)
+        arm_size = 3 * TOOLS + 1 + len(arm_names)
+        humans_size = humans * (PHASES + 2)
         super().__init__(
-            num_envs,
-            [moves] * robots + [tasks],
-            np.zeros_like(high),
-            high,
-            [robot_size] * robots + [arm_size],
-            state_size,
-            horizon,
-            render_mode,
+            num_envs=checks.whole("num_envs", num_envs),
+            macro_action_names=[robot_names] * robots + [arm_names],
+            obs_low=np.zeros_like(obs_high),
+            obs_high=obs_high,
+            obs_sizes=[len(robot_high)] * robots + [len(arm_high)],
+            state_size=robots_size + arm_size + humans_size,
+            horizon=checks.whole("horizon", horizon),
+            render_mode=render_mode,
         )
-        self._build_tables()
-        self.position = np.empty((num_envs, robots, 2))
-        self.location, self.time_left = np.empty((2, num_envs, robots), np.int64)
-        self.carried = np.empty((num_envs, robots, TOOLS), np.int64)
-        self.staged = np.empty((num_envs, capacity), np.int64)
-        self.found = np.empty((num_envs, TOOLS), np.int64)
-        self.arm_task, self.arm_left = np.empty((2, num_envs), np.int64)
-        self.pass_ready = np.empty(num_envs, bool)
-        self.phase, self.clock = np.empty((2, num_envs, humans), np.int64)
-        self.has_next_tool = np.empty((num_envs, humans), bool)
-        self._reset(np.ones(num_envs, bool))
-
-    def _build_tables(self):
-        """Look-up tables: one gather is several times faster than the arithmetic on short axes that it replaces."""
-        envs, humans, robots, capacity = self.num_envs, self.n_humans, self.n_robots, self.staging_capacity
-        self.waypoints = np.stack([np.vstack([self.workshops, self.tool_room, table]) for table in self.tables])
-        self._waypoints = self.waypoints.reshape(-1, 2)
-        self._first_waypoint = np.tile(np.arange(robots) * (humans + 2), (envs, 1))  # of each robot, in _waypoints
-        self._is_workshop = np.eye(humans + 2, humans, dtype=bool)  # [macro-action, human]
-
-        # By the arm's macro-action: its duration, the robot of a Pass (0 for the others), whether it is a Pass.
-        self._task_steps = np.array([self.arm_wait_steps] + [self.pass_steps] * robots + [self.search_steps] * TOOLS)
-        self._task_robot = np.array([0, *range(robots), 0, 0, 0])
-        self._is_pass = np.array([False] + [True] * robots + [False] * TOOLS)
-        self._task_one_hot = np.eye(1 + robots + TOOLS + 1, 1 + robots + TOOLS, dtype=np.float32)  # last row: none
-
-        # Flat positions, by environment, in arrays [N, R], [N, R, TOOLS], [N, R, H] and, by human, in phase_lengths.
-        self._first_robot = np.arange(envs) * robots
-        self._first_carried = np.repeat(np.arange(envs) * robots * TOOLS, humans).reshape(envs, humans)
-        self._first_human = np.repeat(np.arange(envs) * humans, robots).reshape(envs, robots)
-        self._first_phase = np.tile(np.arange(humans) * PHASES, (envs, 1))
-
-        # All observations, a row each: a robot's by location, phase there and number of staged tools (what it carries
-        # is filled in later), then the arm's by queue (which robots stand at the table is filled in later).
-        # A queue is known by its number in base 4, the oldest tool being the lowest digit and 0 an empty place.
-        self._queue_base = (TOOLS + 1) ** np.arange(capacity)
-        queues = [queue[::-1] for queue in itertools.product(range(TOOLS + 1), repeat=capacity)]
-        staged = np.array([[queue.count(1 + tool) for tool in range(TOOLS)] for queue in queues])  # [queue, tool]
-        self._n_staged = staged.sum(axis=1)
-        robot_rows = (humans + 3) * PHASES * (capacity + 1)
-        self._arm_row = robot_rows
-        self._obs_rows = np.zeros((robot_rows + len(queues), *self.single_observation_space.shape[1:]), np.float32)
-        place, phase, number = np.unravel_index(np.arange(robot_rows), (humans + 3, PHASES, capacity + 1))
-        here, rows = place < humans, self._obs_rows
-        rows[np.arange(robot_rows), place] = 1
-        rows[:robot_rows][here, humans + 3 + PHASES * place[here] + phase[here]] = 1
-        shown = ~here & (number > 0)
-        rows[:robot_rows][shown, self.obs_sizes[0] - capacity - 1 + number[shown]] = 1
-        rows[robot_rows:, :TOOLS] = staged
-        self._start_obs = np.zeros((envs, robots + 1, rows.shape[1]), np.float32)
-        self._start_obs[:, :-1, humans + 2] = 1
-
-        # Parts of the state: staged tools and tool in the hand, by queue and whether the arm holds the oldest; a
-        # human's phase and whether it has its next tool (the clock between them is filled in later).
-        in_hand = np.eye(TOOLS + 1, dtype=np.float32)[[queue[0] for queue in queues], 1:]
-        in_hand = np.stack([np.zeros_like(in_hand), in_hand], axis=1)  # [queue, held?, tool]
-        self._queue_rows = np.concatenate([np.stack([staged, staged], axis=1), in_hand], axis=2).reshape(-1, 2 * TOOLS)
-        self._human_rows = np.zeros((2 * PHASES, PHASES + 2), np.float32)
-        self._human_rows[np.arange(2 * PHASES), np.arange(2 * PHASES) // 2] = 1
-        self._human_rows[1::2, -1] = 1
+        self.position = np.zeros((self.num_envs, robots, 2))
+        self.location = np.zeros((self.num_envs, robots), np.int64)
+        self.under_way = np.zeros((self.num_envs, robots), bool)
+        self.waited = np.zeros((self.num_envs, robots), np.int64)
+        self.carried = np.zeros((self.num_envs, robots, TOOLS), np.int64)
+        self.staged = np.zeros((self.num_envs, self.staging_capacity), np.int64)
+        self.found = np.zeros((self.num_envs, TOOLS), np.int64)
+        self.arm_left = np.zeros(self.num_envs, np.int64)
+        self.pass_ready = np.zeros(self.num_envs, bool)
+        self.phase = np.zeros((self.num_envs, humans), np.int64)
+        self.clock = np.zeros((self.num_envs, humans), np.int64)
+        self.has_next_tool = np.zeros((self.num_envs, humans), bool)
+        self._reset(np.ones(self.num_envs, bool))
 
     def _reset(self, mask):
-        self.position[mask], self.location[mask], self.time_left[mask] = self.starts, self.n_humans + 2, 0
-        self.carried[mask], self.staged[mask], self.found[mask] = 0, -1, 0
-        self.arm_task[mask], self.arm_left[mask], self.pass_ready[mask] = -1, 0, False
-        self.phase[mask], self.clock[mask], self.has_next_tool[mask] = 0, self.phase_lengths[:, 0], False
+        self.position[mask] = self.starts
+        self.location[mask] = self.nowhere_yet
+        self.under_way[mask] = False
+        self.waited[mask] = 0
+        self.carried[mask] = 0
+        self.staged[mask] = NO_TOOL
+        self.found[mask] = 0
+        self.arm_left[mask] = 0
+        self.pass_ready[mask] = False
+        self.phase[mask] = 0
+        self.clock[mask] = self.phase_lengths[:, 0]
+        self.has_next_tool[mask] = False
 
+    # ---- the rules of one step ----------------------------------------------------------------------------------
     def _advance(self):
-        moves, task = self.macro_action[:, :-1], self.macro_action[:, -1]
-        get_tool = moves == self.n_humans + 1
-        ended = np.empty(self.macro_action.shape, bool)
+        moves = self.macro_action[:, :-1]  # [N, R]
+        task = self.macro_action[:, -1]  # [N]
+        gets_tool = moves == self.table_place
 
-        # Robots move. Distances are rounded as in np.round(distance, 2).
-        target = self._waypoints.take(moves + self._first_waypoint, axis=0)  # [N, R, 2]
-        to_target = target - self.position
-        squared = to_target * to_target
-        distance = np.sqrt(squared[:, :, 0] + squared[:, :, 1])
-        distance *= 100.0
-        np.rint(distance, out=distance)
-        distance /= 100.0
-        arrived = distance <= self.robot_speed
-        to_target *= (self.robot_speed / np.maximum(distance, self.robot_speed))[:, :, None]
-        self.position += to_target
-        np.copyto(self.position, target, where=arrived[:, :, None])
-        np.copyto(self.location, moves, where=arrived)
+        arrived = self._move_robots(moves)
+        gives_up = self._wait_at_table(arrived & gets_tool, ~arrived)
+        rewards = self._deliver(arrived, moves) - self.step_cost
 
-        # Get-Tool waits from the step after its arrival on; only the sign of the time left on the way ever matters.
-        waits = arrived & get_tool & (self.time_left <= 0)
-        np.minimum(self.time_left, 0, out=self.time_left)
-        self.time_left -= waits
-        np.copyto(self.time_left, 1, where=~arrived)
-        timed_out = waits & (self.time_left <= -self.tool_wait_steps)
-        np.copyto(self.time_left, -1, where=timed_out)
-        ended[:, :-1] = timed_out | (arrived & ~get_tool)
+        task_ends = self._run_arm(task)
+        self._stage_found_tool(task, task_ends)
+        served, pass_fails = self._hand_over(task, task_ends, gets_tool)
+        rewards -= np.where(pass_fails, self.failed_pass_penalty, 0.0)
 
-        # Robots deliver, in order: two may bring a human the same tool. `arrived` says that the robot stands at the
-        # workshop; `location` alone would not, since in the primitive version a robot can turn round on its way.
-        visits = self._is_workshop.take(np.where(arrived, moves, self.n_humans), axis=0)  # [N, R, H]
-        carried, had_tool = self.carried.reshape(-1), self.has_next_tool.copy()
-        for robot in range(self.n_robots):
-            needed = self.phase + (self._first_carried + TOOLS * robot)  # out of range in phase 4, which needs none
-            delivers = visits[:, robot] & ~self.has_next_tool & (carried.take(needed, mode="clip") > 0)
-            carried[needed[delivers]] -= 1
-            self.has_next_tool |= delivers
-        value = self.delivery_reward - self.late_penalty * (self.clock <= 0)
-        rewards = np.add.reduce(value * (self.has_next_tool ^ had_tool), axis=1) - self.step_cost
-
-        # The arm. `partner` is the flat index of the robot that a Pass is for.
-        starts = (task != self.arm_task) | (self.arm_left == 0) if self.primitive else self.macro_done[:, -1]
-        partner = self._task_robot.take(task) + self._first_robot
-        waiting = (self.location == self.n_humans + 1) & (self.time_left < 0)
-        self.arm_task[:] = task
-        np.copyto(self.pass_ready, waiting.take(partner), where=starts)
-        np.copyto(self.arm_left, self._task_steps.take(task), where=starts)
-        self.arm_left -= 1
-        ended[:, -1] = arm_ended = self.arm_left == 0
-
-        search_ended = np.flatnonzero(arm_ended & (task > self.n_robots))
-        if search_ended.size:
-            tool = task[search_ended] - (self.n_robots + 1)
-            number = np.count_nonzero(self.staged[search_ended] >= 0, axis=1)
-            finds = (number < self.staging_capacity) & (self.found[search_ended, tool] < self.copies[tool])
-            env, tool = search_ended[finds], tool[finds]
-            self.staged[env, number[finds]] = tool
-            self.found[env, tool] += 1
-
-        pass_ended = arm_ended & self._is_pass.take(task)
-        receives = pass_ended & self.pass_ready & (get_tool & (self.time_left < 0)).take(partner)
-        rewards -= self.failed_pass_penalty * (pass_ended ^ receives)
-        env = np.flatnonzero(receives)
-        if env.size:
-            robot, tool = task[env] - 1, self.staged[env, 0]
-            self.time_left[env, robot], ended[env, robot] = 0, True
-            is_staged = tool >= 0
-            self.carried[env[is_staged], robot[is_staged], tool[is_staged]] += 1
-            self.staged[env, :-1], self.staged[env, -1] = self.staged[env, 1:], -1
-
-        # Termination, then the humans' clocks. From the last phase on there is nothing more to fetch.
-        terminations = np.logical_and.reduce((self.phase >= PHASES - 2) & self.has_next_tool, axis=1)
-        in_last_phase = self.phase == PHASES - 1
-        self.clock -= ~in_last_phase | (self.clock > 0)
-        begins = (self.clock <= 0) & self.has_next_tool & ~in_last_phase
-        if begins.any():
-            self.phase += begins
-            np.copyto(self.clock, self.phase_lengths.take(self.phase + self._first_phase), where=begins)
-            np.copyto(self.has_next_tool, self.phase == PHASES - 1, where=begins)
+        move_ends = (arrived & ~gets_tool) | gives_up | served
+        ended = np.column_stack([move_ends, task_ends])
         if self.primitive:
             ended[:] = True
-        return rewards, terminations, ended, terminations
 
+        has_last_tool = (self.phase >= LAST_PHASE - 1) & self.has_next_tool
+        all_supplied = has_last_tool.all(axis=1)
+        self._advance_humans()
+        return rewards, all_supplied, ended, all_supplied
+
+    def _move_robots(self, moves):
+        """Moves each robot one step towards its waypoint and returns which stand on it now, bool [N, R]."""
+        target = self.waypoints[np.arange(self.n_robots), moves]
+        to_target = target - self.position
+        distance = np.round(np.linalg.norm(to_target, axis=2), 2)  # to the centimetre, as in the published benchmark
+        arrived = distance <= self.robot_speed
+        share = self.robot_speed / np.maximum(distance, self.robot_speed)  # of the way that is left
+        moved = self.position + share[..., None] * to_target
+        self.position = np.where(arrived[..., None], target, moved)
+        self.location = np.where(arrived, moves, self.location)
+        return arrived
+
+    def _wait_at_table(self, at_table, under_way):
+        """Counts the steps of waiting of the robots that are on Get-Tool and at the table.
+
+        Returns:
+            gives_up bool [N, R], the robots that have waited in vain for long enough.
+        """
+        has_just_come = self.under_way
+        waits = at_table & ~has_just_come
+        self.waited[waits] += 1
+        self.waited[under_way] = 0
+        self.under_way = under_way
+        gives_up = waits & (self.waited >= self.tool_wait_steps)
+        self.waited[gives_up] = 1  # this step is the first of the next wait
+        return gives_up
+
+    def _deliver(self, arrived, moves):
+        """Lets robots at a workshop give its human the next tool and returns the rewards, float64 [N]."""
+        visits = arrived[..., None] & one_hot(moves, self.n_humans)  # [N, R, H]
+        needed = np.minimum(self.phase, TOOLS - 1)  # [N, H]; in the last phase nothing is needed
+        receives = np.zeros_like(self.has_next_tool)
+        for robot in range(self.n_robots):  # one after the other: two may bring a human the same tool
+            carries = np.take_along_axis(self.carried[:, robot], needed, axis=1) > 0
+            delivers = visits[:, robot] & carries & ~self.has_next_tool
+            env, human = np.nonzero(delivers)
+            self.carried[env, robot, needed[env, human]] -= 1
+            self.has_next_tool |= delivers
+            receives |= delivers
+        late = self.clock <= 0
+        value = np.where(late, self.delivery_reward - self.late_penalty, self.delivery_reward)
+        return np.where(receives, value, 0.0).sum(axis=1)
+
+    def _run_arm(self, task):
+        """Runs the arm's macro-action for a step, the first one if it was free; returns where it ends, bool [N]."""
+        starts = self.macro_done[:, -1]
+        is_waiting = (self.location == self.table_place) & (self.waited >= 1)
+        can_pass = (self._receiver(task) & is_waiting).any(axis=1)
+        self.pass_ready = np.where(starts, can_pass, self.pass_ready)
+        self.arm_left = np.where(starts, self.task_steps[task], self.arm_left) - 1
+        return self.arm_left == 0
+
+    def _stage_found_tool(self, task, task_ends):
+        """Ends Search: a copy of the tool, if one is left, goes to the end of the queue, if there is room."""
+        n_staged = self._n_staged()
+        has_room = n_staged < self.staging_capacity
+        search_ends = self._sought(task) & task_ends[:, None]  # [N, TOOLS]
+        finds = search_ends & has_room[:, None] & (self.found < self.copies)
+        env, tool = np.nonzero(finds)
+        self.found[env, tool] += 1
+        self.staged[env, n_staged[env]] = tool
+
+    def _hand_over(self, task, task_ends, gets_tool):
+        """Ends Pass: the oldest staged tool, if there is one, goes to the robot, and the queue moves up.
+
+        Returns:
+            served bool [N, R], the robots whose Get-Tool ends by it, and fails bool [N], where the Pass has failed.
+        """
+        pass_ends = self._receiver(task) & task_ends[:, None]  # [N, R]
+        served = pass_ends & self.pass_ready[:, None] & gets_tool & (self.waited >= 1)
+        fails = (pass_ends & ~served).any(axis=1)
+        self.waited[served] = 0
+
+        oldest = self.staged[:, 0]
+        has_tool = oldest != NO_TOOL
+        env, robot = np.nonzero(served & has_tool[:, None])
+        self.carried[env, robot, oldest[env]] += 1
+        self.staged[env, :-1] = self.staged[env, 1:]
+        self.staged[env, -1] = NO_TOOL
+        return served, fails
+
+    def _advance_humans(self):
+        """Counts down the clocks and begins the next phase where the clock has run down and the next tool is there."""
+        in_last_phase = self.phase == LAST_PHASE
+        finished = in_last_phase & (self.clock <= 0)
+        self.clock[~finished] -= 1
+        begins = ~in_last_phase & (self.clock <= 0) & self.has_next_tool
+        self.phase[begins] += 1
+        self.clock[begins] = self._phase_length()[begins]
+        self.has_next_tool[begins] = self.phase[begins] == LAST_PHASE  # which needs no further tool
+
+    def _receiver(self, task):
+        """The robot to which a Pass goes, one-hot [N, R]; all False for the arm's other macro-actions."""
+        return one_hot(task - 1, self.n_robots)
+
+    def _sought(self, task):
+        """The tool for which a Search looks, one-hot [N, TOOLS]; all False for the arm's other macro-actions."""
+        return one_hot(task - 1 - self.n_robots, TOOLS)
+
+    def _n_staged(self):
+        """How many tools are staged, int [N]."""
+        return (self.staged != NO_TOOL).sum(axis=1)
+
+    def _phase_length(self):
+        """How many steps each human's phase takes, int [N, H]."""
+        return self.phase_lengths[np.arange(self.n_humans), self.phase]
+
+    # ---- observations and the state, in the order of the class docstring ----------------------------------------
     def _observe(self, start):
+        robots = self._observe_robots()
+        arm = self._observe_arm()
+        obs = np.zeros(self._obs.shape, np.float32)
+        obs[:, :-1, : robots.shape[2]] = robots
+        obs[:, -1, : arm.shape[1]] = arm
         if start:
-            return self._start_obs
-        queue = self._queue_number()
-        phase_here = self.phase.take(self.location + self._first_human, mode="clip")  # unused away from the workshops
-        rows = np.empty(self.macro_done.shape, np.int64)
-        rows[:, :-1] = (self.location * PHASES + phase_here) * (self.staging_capacity + 1)
-        rows[:, :-1] += self._n_staged.take(queue)[:, None]
-        rows[:, -1] = queue + self._arm_row
-        obs = self._obs_rows.take(rows, axis=0)
-        after = self.obs_sizes[0] - self.staging_capacity
-        obs[:, :-1, after - TOOLS : after] = self.carried
-        at_table = self.position == self.tables
-        obs[:, -1, TOOLS : TOOLS + self.n_robots] = at_table[:, :, 0] & at_table[:, :, 1]
+            obs[:, -1] = 0.0  # the arm does not see yet who stands at the table
         return obs
 
-    def _queue_number(self):
-        return (self.staged + 1) @ self._queue_base
+    def _observe_robots(self):
+        place = one_hot(self.location, self.nowhere_yet + 1)
+        at_workshop = place[:, :, : self.n_humans]
+        phase = one_hot(self.phase, PHASES)
+        phase_here = at_workshop[..., None] & phase[:, None]  # [N, R, H, PHASES]
+        phases_seen = phase_here.reshape(self.num_envs, self.n_robots, -1)
+
+        sees_queue = self.location >= self.tool_room_place  # in the tool room, at the table or nowhere yet
+        n_staged = one_hot(self._n_staged() - 1, self.staging_capacity)
+        n_staged_seen = sees_queue[..., None] & n_staged[:, None]
+        return np.concatenate([place, phases_seen, self.carried, n_staged_seen], axis=2)
+
+    def _observe_arm(self):
+        stands_at_table = (self.position == self.tables).all(axis=2)
+        return np.concatenate([self._staged_counts(), stands_at_table], axis=1)
+
+    def _staged_counts(self):
+        """How many of each tool are staged, int [N, TOOLS]."""
+        return one_hot(self.staged, TOOLS).sum(axis=1)
 
     def _state(self):
-        state = np.empty((self.num_envs, self.state_size), np.float32)
-        arm, humans = (2 + TOOLS) * self.n_robots, self.state_size - (PHASES + 2) * self.n_humans
-        robot_part = state[:, :arm].reshape(self.num_envs, self.n_robots, 2 + TOOLS)
-        robot_part[:, :, :2] = self.position / self.room_size
-        robot_part[:, :, 2:] = self.carried
+        robots = np.concatenate([self.position / self.room_size, self.carried], axis=2)
+
         is_running = self.arm_left > 0
-        task = np.where(is_running, self.arm_task, -1)
-        in_hand = is_running & self.pass_ready & self._is_pass.take(self.arm_task)
-        state[:, arm : arm + 2 * TOOLS] = self._queue_rows.take(2 * self._queue_number() + in_hand, axis=0)
-        state[:, arm + 2 * TOOLS : arm + 3 * TOOLS] = self.found
-        state[:, arm + 3 * TOOLS] = self.arm_left / self._task_steps.max()
-        state[:, arm + 3 * TOOLS + 1 : humans] = self._task_one_hot.take(task, axis=0)
-        human_part = state[:, humans:].reshape(self.num_envs, self.n_humans, PHASES + 2)
-        human_part[:] = self._human_rows.take(2 * self.phase + self.has_next_tool, axis=0)
-        length = self.phase_lengths.take(self.phase + self._first_phase)
-        human_part[:, :, PHASES] = np.maximum(self.clock / length, -1.0)
-        return state
+        in_hand = one_hot(self.staged[:, 0], TOOLS) & (is_running & self.pass_ready)[:, None]
+        share_left = self.arm_left / self.task_steps.max()
+        task = one_hot(self.macro_action[:, -1], len(self.task_steps)) & is_running[:, None]
+        arm = [self._staged_counts(), in_hand, self.found, share_left[:, None], task]
+
+        phase = one_hot(self.phase, PHASES)
+        clock = np.maximum(self.clock / self._phase_length(), -1.0)
+        humans = np.concatenate([phase, clock[..., None], self.has_next_tool[..., None]], axis=2)
+
+        parts = [robots.reshape(self.num_envs, -1), *arm, humans.reshape(self.num_envs, -1)]
+        return np.concatenate(parts, axis=1).astype(np.float32)
 
     def _draw(self, index):
         from envs.rendering import draw_warehouse  # only needed, and only imports pillow, for pictures
 
         return draw_warehouse(self, index)
-
-
-def _numbers(name, value, shape=(), positive=False):
-    try:
-        array = np.array(value, np.float64)
-    except (TypeError, ValueError):  # not numbers at all, or rows of different lengths
-        array = np.array([np.nan])
-    if array.shape != shape or not np.isfinite(array).all() or (positive and (array <= 0).any()):
-        kind = "finite positive" if positive else "finite"
-        what = f"{kind} numbers of shape {shape}" if shape else f"a {kind} number"
-        raise ValueError(f"{name} must be {what}, got {value!r}")
-    return array
-
-
-def _rows(name, value, width):
-    """At least one row, one per robot or human."""
-    count = len(value) if hasattr(value, "__len__") else 0
-    if count == 0:
-        raise ValueError(f"{name} must be a list with at least one entry, got {value!r}")
-    return _numbers(name, value, (count, width))
-
-
-def _whole(name, value, shape=()):
-    """Counts and durations: whole numbers of at least 1."""
-    array = _numbers(name, value, shape)
-    if (array < 1).any() or (array != np.rint(array)).any():
-        raise ValueError(f"{name} must be whole and at least 1, got {np.asarray(value).tolist()}")
-    return array.astype(np.int64)

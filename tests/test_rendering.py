@@ -131,9 +131,9 @@ SEEN = {
     "wtd-t1": [
         *PANEL,
         *[("position", (0, 0, 0), 5.0), ("position", (0, 2, 1), 4.5), ("location", (0, 0), 5)],
-        *[("carried", (0, 1, 2), 1), ("carried", (0, 1, 0), 2), ("time_left", (0, 0), -5)],
+        *[("carried", (0, 1, 2), 1), ("carried", (0, 1, 0), 2), ("waited", (0, 0), 5), ("under_way", (0, 0), True)],
         *[("staged", (0, 0), 2), ("staged", (0, 1), 0), ("found", (0, 1), 2), ("found", (0, 2), 3)],
-        *[("arm_task", 0, 1), ("arm_left", 0, 2), ("pass_ready", 0, True)],
+        *[("macro_action", (0, -1), 1), ("arm_left", 0, 2), ("pass_ready", 0, True)],
         *[("phase", (0, 1), 2), ("clock", (0, 2), 5), ("clock", (0, 0), 0), ("has_next_tool", (0, 1), True)],
     ],
     "ct-10": [
@@ -150,9 +150,10 @@ def busy(env_id):
     env.macro_action[:], env.macro_done[:] = 0, False
     if env_id == "wtd-t1":
         env.macro_action[0, 0], env.macro_action[0, -1] = env.n_humans + 1, 3
-        env.position[0, 0], env.location[0, 0], env.time_left[0, 0] = env.tables[0], env.n_humans + 1, -2
+        env.position[0, 0], env.location[0, 0], env.waited[0, 0] = env.tables[0], env.n_humans + 1, 2
+        env.under_way[0, 0] = False
         env.macro_done[0, 1] = True
-        env.arm_task[:], env.arm_left[:], env.staged[:] = 3, 3, 1
+        env.arm_left[:], env.staged[:] = 3, 1
     if env_id == "ct-10":
         env.position[:], env.target[:], env.goal[:], env.visible[:] = 4, 6, 6, True
     return env
@@ -225,7 +226,7 @@ def test_the_red_cross_is_seen_under_all_agents():
 def test_a_tool_being_passed_is_in_the_hand_and_no_longer_on_the_table():
     env = started("wtd-s")
     nowhere = pixels_of(picture(env), rendering.SKY)
-    env.staged[0, 0], env.arm_task[:], env.arm_left[:] = 2, 1, 3
+    env.staged[0, 0], env.macro_action[:, -1], env.arm_left[:] = 2, 1, 3
     on_table = pixels_of(picture(env), rendering.SKY)
     env.pass_ready[:] = True
     assert nowhere < pixels_of(picture(env), rendering.SKY) < on_table

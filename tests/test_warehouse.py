@@ -42,7 +42,12 @@ def bits(text):
 
 def place(env, robot, waypoint, carried=(0, 0, 0)):
     env.position[0, robot], env.location[0, robot] = env.waypoints[robot, waypoint], waypoint
-    env.time_left[0, robot], env.carried[0, robot] = 0, carried
+    env.under_way[0, robot], env.waited[0, robot], env.carried[0, robot] = False, 0, carried
+
+
+def set_free(env, agent):
+    env.macro_done[0, agent] = True
+    env._update_available()
 
 
 @pytest.mark.parametrize(("layout", "agents", "actions", "obs_sizes", "state_size"), [
@@ -111,10 +116,25 @@ def test_get_tool_waits_ten_steps():
     env = started()
     arrival = 5  # 2.66 m at 0.6 m a step
     assert until_done(env, (GET_TOOL, GET_TOOL, WAIT), agent=0)[0] == arrival + 10
-    assert env.time_left[0, 0] == -1
+    assert env.waited[0, 0] == 1
     assert until_done(env, (GET_TOOL, GET_TOOL, WAIT), agent=0)[0] == 9  # one step of waiting is counted already
     short = started(tool_wait_steps=3)
     assert until_done(short, (GET_TOOL, GET_TOOL, WAIT), agent=0)[0] == arrival + 3
+
+
+def test_steps_of_waiting_are_counted_from_the_step_after_the_arrival():
+    env, seen = started(), []
+    for _ in range(7):
+        run(env, (GET_TOOL, GO_TR, WAIT))
+        seen.append((env.under_way[0, 0], env.waited[0, 0]))
+    assert seen == [(True, 0)] * 4 + [(False, 0), (False, 1), (False, 2)]
+    set_free(env, 0)
+    run(env, (GO_W, GO_TR, WAIT))
+    assert env.under_way[0, 0] and env.waited[0, 0] == 0
+    near = started(starts=LAYOUTS["s"]["tables"])  # a single step to the table is a step of waiting already
+    run(near, (GET_TOOL, GO_W, WAIT))
+    assert near.waited[0].tolist() == [1, 0] and near.under_way[0].tolist() == [False, True]
+    assert until_done(near, (GET_TOOL, GO_W, WAIT), agent=0)[0] == 9
 
 
 def test_search_then_pass_ends_get_tool():
@@ -129,7 +149,7 @@ def test_search_then_pass_ends_get_tool():
     rewards, obs, _, infos = run(env, *[(GET_TOOL, GET_TOOL, PASS_1)] * 3)
     assert rewards == [-1, -1, -1] and infos["macro_done"][0].tolist() == [False, True, True]
     assert env.carried[0].tolist() == [[0, 0, 0], [0, 1, 0]] and env.staged[0].tolist() == [-1, -1]
-    assert env.time_left[0, 1] == 0 and obs[2].tolist() == bits("000 11 00000000")
+    assert env.waited[0, 1] == 0 and obs[2].tolist() == bits("000 11 00000000")
     assert obs[1].tolist() == bits("0010 0000 010 00")
 
 
@@ -154,7 +174,7 @@ def test_pass_fails_if_the_robot_is_not_there_at_its_first_step():
     env = started()
     until_done(env, (GO_TR, GO_TR, SEARCH_0), agent=2)
     place(env, 0, GET_TOOL)
-    env.macro_done[0, 0] = True
+    set_free(env, 0)
     run(env, (GET_TOOL, GO_TR, WAIT))
     until_done(env, (GET_TOOL, GO_TR, PASS_1), agent=2)
     assert until_done(env, (GET_TOOL, GO_TR, PASS_1), agent=2) == (4, -11)
@@ -162,7 +182,7 @@ def test_pass_fails_if_the_robot_is_not_there_at_its_first_step():
     # A robot that arrives during the Pass gets nothing either.
     env = started()
     until_done(env, (GO_TR, GET_TOOL, SEARCH_0), agent=2)
-    env.time_left[0, 1] = 1
+    env.waited[0, 1], env.under_way[0, 1] = 0, True
     _, _, _, infos = run(env, (GO_TR, GET_TOOL, PASS_1))
     assert infos["state"][0, 10:16].tolist() == bits("100 000")  # nothing in its hand
     assert until_done(env, (GO_TR, GET_TOOL, PASS_1), agent=2) == (3, -11)
@@ -171,19 +191,19 @@ def test_pass_fails_if_the_robot_is_not_there_at_its_first_step():
 def test_pass_fails_if_the_robot_leaves():
     env = started()
     until_done(env, (GET_TOOL, GET_TOOL, SEARCH_0), agent=2)
-    env.time_left[0, 0] = -8  # robot 0 gives up in the second step of the Pass
+    env.waited[0, 0] = 8  # robot 0 gives up in the second step of the Pass
     assert until_done(env, (GET_TOOL, GET_TOOL, PASS_0), agent=0)[0] == 2
     assert run(env, (GO_W, GET_TOOL, PASS_0), (GO_W, GET_TOOL, PASS_0))[0] == [-1, -11]
     assert env.staged[0].tolist() == [0, -1]
 
 
 def test_pass_fails_if_the_robot_is_not_in_get_tool_at_its_end():
-    env = started(tool_room=(0.8, 3.1))  # so near to robot 0's table that going there leaves its time left as it is
+    env = started(tool_room=(0.8, 3.1))  # so near to robot 0's table that going there leaves its count as it is
     place(env, 0, GET_TOOL)
-    env.time_left[0, 0] = -8
+    env.waited[0, 0] = 8
     assert until_done(env, (GET_TOOL, GO_TR, PASS_0), agent=0)[0] == 2
     assert run(env, (GO_TR, GO_TR, PASS_0), (GO_TR, GO_TR, PASS_0))[0] == [-1, -11]
-    assert env.time_left[0, 0] == -1
+    assert env.waited[0, 0] == 1
 
 
 def test_arm_sees_who_stands_exactly_at_the_table():
@@ -194,6 +214,15 @@ def test_arm_sees_who_stands_exactly_at_the_table():
     for near in [(0.8, 3.3), (1.1, 3.0)]:  # only one coordinate is the table's
         env.position[0, 0] = near
         assert env._observe(start=False)[0, 2, :5].tolist() == bits("000 00")
+
+
+def test_a_large_staging_area():
+    env = started(staging_capacity=40, copies=20)
+    for count in range(1, 4):
+        until_done(env, (GO_TR, GO_TR, SEARCH_1), agent=2)
+        assert env.staged[0].tolist() == [1] * count + [-1] * (40 - count)
+    _, obs, *_ = run(env, (GO_TR, GO_TR, WAIT))
+    assert obs[0, 11:].tolist() == [0, 0, 1] + [0] * 37 and obs[2, :3].tolist() == [0, 3, 0]
 
 
 def test_staging_area_and_copies_limit_the_search():
@@ -232,7 +261,7 @@ def test_termination_when_every_human_has_its_last_tool():
     assert not terminated and not infos["success"][0]
     env.phase[0, 0], env.clock[0, 0] = 3, 0  # the first human's work is over: that does not matter
     place(env, 1, 1, carried=(0, 0, 1))
-    env.macro_done[0, 1] = True
+    set_free(env, 1)
     rewards, _, terminated, infos = run(env, (2, 1, 0))
     assert rewards == [99] and terminated and infos["success"][0] and infos["macro_done"].all()
 
@@ -284,18 +313,30 @@ def test_keyword_overrides_the_layout():
 
 @pytest.mark.parametrize(("kwargs", "message"), [
     ({"layout": "x"}, "unknown layout 'x'; valid layouts: s d t t1"),
-    ({"robot_speed": 0}, "robot_speed must be a finite positive number, got 0"),
-    ({"robot_speed": "fast"}, "robot_speed must be a finite positive number, got 'fast'"),
+    ({"robot_speed": 0}, "robot_speed must be above 0, got 0"),
+    ({"robot_speed": "fast"}, "robot_speed must be a finite number, got 'fast'"),
     ({"delivery_reward": float("nan")}, "delivery_reward must be a finite number, got nan"),
     ({"tables": [(1, 1)]}, "tables and starts need one entry per robot, got 1 and 2"),
     ({"workshops": [(1, 1), (2, 2)]}, "workshops and phase_lengths need one entry per human, got 2 and 1"),
     ({"phase_lengths": [(20, 20)]}, "phase_lengths must be finite numbers of shape (1, 4), got [(20, 20)]"),
-    ({"phase_lengths": [(20, 20, 0, 20)]}, "phase_lengths must be whole and at least 1"),
+    ({"phase_lengths": [(20, 20, 0, 20)]}, "phase_lengths must be finite numbers of shape (1, 4) of at least 1"),
+    ({"phase_lengths": [(20, 20, 1.5, 20)]}, "phase_lengths must be whole, got [(20, 20, 1.5, 20)]"),
+    ({"phase_lengths": [(20, 20, 20), (20,)]}, "phase_lengths must be finite numbers of shape (2, 4), got"),
+    ({"primitive": "yes"}, "primitive must be True or False, got 'yes'"),
+    ({"num_envs": 0}, "num_envs must be a finite number of at least 1, got 0"),
+    ({"horizon": 2.5}, "horizon must be whole, got 2.5"),
     ({"workshops": []}, "workshops must be a list with at least one entry, got []"),
-    ({"tool_room": (1, 2, 3)}, "tool_room must be finite numbers of shape (2,)"),
-    ({"copies": 0}, "copies must be whole and at least 1"),
-    ({"search_steps": 2.5}, "search_steps must be whole and at least 1, got 2.5"),
-    ({"staging_capacity": 7}, "staging_capacity must be at most 6, got 7"),
+    ({"tool_room": (1, 2, 3)}, "tool_room must be finite numbers of shape (2,), got (1, 2, 3)"),
+    ({"room_size": (9, 0)}, "room_size must be above 0, got (9, 0)"),
+    ({"copies": 0}, "copies must be finite numbers of shape (3,) of at least 1, got [0, 0, 0]"),
+    ({"copies": (1, 1)}, "copies must be finite numbers of shape (3,) of at least 1, got (1, 1)"),
+    ({"search_steps": 2.5}, "search_steps must be whole, got 2.5"),
+    ({"pass_steps": 0}, "pass_steps must be a finite number of at least 1, got 0"),
+    ({"tool_wait_steps": "10"}, "tool_wait_steps must be a finite number of at least 1, got '10'"),
+    ({"staging_capacity": 0}, "staging_capacity must be a finite number of at least 1, got 0"),
+    ({"primitive": True, "search_steps": 6}, "search_steps must be 1 with primitive=True, got 6"),
+    ({"primitive": True, "pass_steps": 4}, "pass_steps must be 1 with primitive=True, got 4"),
+    ({"primitive": True, "arm_wait_steps": 2}, "arm_wait_steps must be 1 with primitive=True, got 2"),
 ])  # fmt: skip
 def test_bad_arguments(kwargs, message):
     with pytest.raises(ValueError) as error:
@@ -313,28 +354,51 @@ def test_primitive_asks_everybody_every_step():
 
 
 @pytest.mark.parametrize(("actions", "found"), [
-    ([SEARCH_0] * 6, 1),
-    ([SEARCH_0] * 5, 0),
-    ([SEARCH_0] * 5 + [WAIT] + [SEARCH_0] * 5, 0),
-    ([SEARCH_0] * 5 + [SEARCH_1] * 5 + [SEARCH_0], 0),
-    ([SEARCH_0] * 5 + [WAIT] + [SEARCH_0] * 6, 1),
-    ([SEARCH_0] * 12, 2),
-    ([SEARCH_0] * 11, 1),
+    ([SEARCH_0], [1, 0, 0]),
+    ([SEARCH_0, WAIT, SEARCH_1], [1, 1, 0]),
+    ([SEARCH_0, SEARCH_0], [2, 0, 0]),
+    ([SEARCH_0, SEARCH_2, SEARCH_1], [1, 0, 1]),  # there is room for two
 ])  # fmt: skip
-def test_primitive_search_takes_six_steps_in_a_row(actions, found):
+def test_primitive_search_finds_its_tool_in_one_step(actions, found):
     env = started(primitive=True, copies=2)
-    run(env, *[(GO_TR, GO_TR, action) for action in actions])
-    assert env.found[0].sum() == found
+    rewards, *_ = run(env, *[(GO_TR, GO_TR, action) for action in actions])
+    assert env.found[0].tolist() == found and rewards == [-1] * len(actions)
+    assert (env.staged[0] >= 0).sum() == sum(found)
 
 
-def test_primitive_pass():
+def test_primitive_copies_limit_the_search():
     env = started(primitive=True)
-    run(env, *[(GET_TOOL, GET_TOOL, SEARCH_0)] * 6)
-    broken_off = [(GET_TOOL, GET_TOOL, PASS_0)] * 3 + [(GET_TOOL, GET_TOOL, WAIT)]
-    rewards, *_ = run(env, *broken_off, *[(GET_TOOL, GET_TOOL, PASS_0)] * 4)
-    assert rewards == [-1] * 8 and env.carried[0, 0].tolist() == [1, 0, 0]
-    rewards, *_ = run(env, *[(GO_W, GET_TOOL, PASS_0)] * 4)
-    assert rewards == [-1, -1, -1, -11]
+    run(env, *[(GO_TR, GO_TR, SEARCH_0)] * 3)
+    assert env.found[0].tolist() == [1, 0, 0] and env.staged[0].tolist() == [0, -1]
+
+
+def test_primitive_pass_hands_over_in_one_step():
+    env = started(primitive=True)
+    run(env, (GET_TOOL, GET_TOOL, SEARCH_2), *[(GET_TOOL, GET_TOOL, WAIT)] * 3)
+    assert run(env, (GET_TOOL, GET_TOOL, PASS_0))[0] == [-11]  # it arrives in this step and waits from the next one on
+    rewards, _, _, infos = run(env, (GET_TOOL, GET_TOOL, PASS_0))
+    assert rewards == [-1] and env.carried[0].tolist() == [[0, 0, 1], [0, 0, 0]] and env.staged[0].tolist() == [-1, -1]
+    assert infos["state"][0, 10:26].tolist() == [0] * 8 + [1] + [0] * 7  # tool 2 is found, and nothing is running
+    assert run(env, (GO_W, GET_TOOL, PASS_0))[0] == [-11]  # robot 0 is leaving
+
+
+def test_primitive_durations_are_one_step():
+    env = Warehouse(primitive=True, search_steps=1, pass_steps=1, arm_wait_steps=1)
+    assert env.task_steps.tolist() == Warehouse(primitive=True).task_steps.tolist() == [1] * 6
+    assert Warehouse().task_steps.tolist() == [1, 4, 4, 6, 6, 6]
+
+
+def test_primitive_random_play_delivers_now_and_then():
+    """About 2.3% of random episodes see a positive reward, so there is something to learn from."""
+    env, rng = started(1500, primitive=True), np.random.default_rng(0)
+    delivers, live = np.zeros(1500, bool), np.ones(1500, bool)
+    while live.any():
+        _, rewards, terminations, truncations, _ = env.step(rng.integers(0, env.n_actions, (1500, 3)))
+        delivers |= live & (rewards > 0)
+        over = terminations | truncations
+        live &= ~over
+        env.reset(options={"reset_mask": over})
+    assert 0.01 < delivers.mean() < 0.045
 
 
 def test_primitive_delivery_needs_the_robot_at_the_workshop():
