@@ -2,22 +2,23 @@
 
 The agents of a team run macro-actions. These last for different numbers of steps, so the agents decide at different
 times. Each agent has a recurrent utility network Q_i over its own macro-history. The sum of the utilities is the joint
-value, which is trained on the team's reward (paper: "Value Factorization for Asynchronous Multi-Agent
+value, which is trained on the team's reward ("the paper" below: "Value Factorization for Asynchronous Multi-Agent
 Reinforcement Learning"). Three ideas carry the whole file:
 
-    row        A time step at which at least one agent is free and starts a macro-action. Only rows are stored and
-               learned from (Fig. 2 of the paper). The steps between two rows are summed up in a reward and a discount.
+    row        A time step at which at least one agent is free and starts a macro-action. Only rows are stored (Fig. 2
+               of the paper). The steps between two rows are summed up in a reward and a discount.
     available  What an agent can do at a row. A free agent chooses among the macro-actions that it can start. A busy
-               agent can only go on. So the argmax "given m^-" of Eqs. 5 and 7 is the argmax over what is available,
-               and hardly a line has to know who is busy.
-    target     y = r + gamma^tau Q'(h', m*), where m* is that argmax of the online network (Eq. 14, double Q).
+               agent can only go on. So the paper's argmax given the macro-actions of the busy agents (Eqs. 5 and 7)
+               is simply an argmax over what is available.
+    target     y = r + gamma^tau Q'(h', m*) (Eq. 14), tau steps later, at the next row. Q' is the target network, and
+               m* is the argmax of the online network over what is available there (double Q).
 
-Shapes: B episodes or N environments, T rows, n agents, A macro-actions of the agent that has most, d numbers of a
-macro-observation, H hidden units.
+Shapes: N environments, B episodes, T rows, L decisions of an agent, n agents, A macro-actions of the agent that has
+most (for the others the rest is never available), d numbers of a macro-observation, H hidden units.
 
 Numbered deviations from the paper:
- 1. An episode that is cut by the horizon bootstraps from its final observation. At this cut every agent counts as free.
- 2. Whole episodes are replayed, drawn with replacement, not windows of 25 rows. Returns are Q(lambda) returns. Negative
+ 1. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
+ 2. Whole episodes are replayed, drawn with replacement, not windows of 25 rows. Targets are Q(lambda) returns. Negative
     TD errors count less while agents explore (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
 """
 
@@ -41,7 +42,7 @@ from tqdm import tqdm
 import envs
 
 ALGORITHM = Path(__file__).stem
-SHARES = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteresis")  # settings that are at most 1
+AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteresis")
 
 
 @dataclass
@@ -65,34 +66,32 @@ class Args:
     buffer_size: int = 2_500  # episodes in the replay buffer
     batch_size: int = 16  # episodes in an update
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
-    learning_starts: int = 5_000  # environment steps at random before the first update
-    exploration_timesteps: int = 100_000  # steps after these over which epsilon falls linearly from 1
-    end_e: float = 0.05  # epsilon from then on
+    learning_starts: int = 5_000  # environment steps with random macro-actions, before the first update
+    exploration_timesteps: int = 100_000  # environment steps after these over which epsilon falls from 1
+    end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors while epsilon falls; it then rises to 1 over as many steps
+    hysteresis: float = 1.0  # factor on negative TD errors, which rises to 1 once epsilon has fallen
     hidden_size: int = 64  # width of the agents' layers
-    ongoing: Literal["update", "detach", "zero"] = "update"  # what busy agents' utilities do in the loss, see td_loss
+    ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities in the loss, see td_loss
 
     def __post_init__(self):
         problem = envs.problem(self.env)
         if problem:
             raise SystemExit(f"--env: {problem}")
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise SystemExit("--device cuda: there is none")
         for name, value in vars(self).items():
             low = 1 if type(value) is int and name not in ("seed", "learning_starts") else 0
-            high = 1 if name in SHARES else 10**15
-            if type(value) in (int, float) and not low <= value <= high:  # tyro has checked the others
+            high = 1 if name in AT_MOST_1 else 10**15
+            if type(value) in (int, float) and not low <= value <= high:
                 raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
-# Tasks whose ids begin so need other values. docs/defaults.md says how they were chosen.
+# Other values for the tasks whose ids begin with the key. docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(
+    "bp-": dict(
         total_timesteps=600_000,
         learning_starts=150_000,
         exploration_timesteps=200_000,
@@ -101,12 +100,10 @@ DEFAULTS = {
     "wtd-d": dict(total_timesteps=300_000),
     "wtd-t": dict(
         total_timesteps=600_000,
-        exploration_timesteps=150_000,
         train_frequency=128,
     ),
-    "ct": dict(
+    "ct-": dict(
         total_timesteps=600_000,
-        exploration_timesteps=150_000,
         num_envs=128,
         eval_episodes=400,
         train_frequency=256,
@@ -118,7 +115,7 @@ DEFAULTS = {
 
 
 class AgentLinear(nn.Module):
-    """A linear layer of each agent, computed as one batched product: [n, ..., inputs] -> [n, ..., outputs]."""
+    """One linear layer for each agent, as a batched product: [n, ..., inputs] -> [n, ..., outputs]."""
 
     def __init__(self, n_agents, inputs, outputs):
         super().__init__()
@@ -127,14 +124,15 @@ class AgentLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(n_agents, 1, outputs).uniform_(-bound, bound))
 
     def forward(self, x):
-        return torch.baddbmm(self.bias, x.flatten(1, -2), self.weight).unflatten(1, x.shape[1:-1])
+        flat = x.flatten(1, -2)  # [n, all in between, inputs]
+        return torch.baddbmm(self.bias, flat, self.weight).unflatten(1, x.shape[1:-1])
 
 
 class Agents(nn.Module):
     """The agents' utility networks Q_i(h_i, .): Linear, ReLU, GRU, Linear, ReLU, Linear.
 
-    Agents share no weights, but their networks have one shape. So they run side by side, as batched products. An
-    nn.GRU for each agent, in a loop, makes an update take up to twice as long.
+    Agents share no weights, but their networks have one shape. So they run side by side, as batched products, and the
+    GRU is written out. With an nn.GRU for each agent an update would take up to twice as long.
     """
 
     def __init__(self, n_agents, n_actions, obs_size, hidden_size, obs_scale=1.0):
@@ -142,20 +140,20 @@ class Agents(nn.Module):
         self.n_actions = n_actions
         self.obs_scale = obs_scale
         self.encoder = AgentLinear(n_agents, obs_size + n_actions, hidden_size)
-        self.gru_input = AgentLinear(n_agents, hidden_size, 3 * hidden_size)
+        self.input_layer = AgentLinear(n_agents, hidden_size, 3 * hidden_size)
         bound = hidden_size**-0.5
-        gru_hidden = torch.empty(n_agents, hidden_size, 3 * hidden_size)
-        self.gru_hidden = nn.Parameter(gru_hidden.uniform_(-bound, bound))
+        hidden_weight = torch.empty(n_agents, hidden_size, 3 * hidden_size)  # without a bias of its own
+        self.hidden_weight = nn.Parameter(hidden_weight.uniform_(-bound, bound))
         self.head = AgentLinear(n_agents, hidden_size, hidden_size)
         self.output = AgentLinear(n_agents, hidden_size, n_actions)
 
     def start(self, n_episodes):
         """Hidden states before the first decision: zeros, float32 [n, B, H]."""
-        n_agents, hidden_size, _ = self.gru_hidden.shape
-        return self.gru_hidden.new_zeros(n_agents, n_episodes, hidden_size)
+        n_agents, hidden_size, _ = self.hidden_weight.shape
+        return self.hidden_weight.new_zeros(n_agents, n_episodes, hidden_size)
 
     def forward(self, obs, previous, hidden):
-        """Utilities float32 [n, B, L, A] at L decisions of each agent in each episode, and the last hidden states.
+        """Utilities float32 [n, B, L, A] at the L decisions of each agent in each episode, and the last hidden states.
 
         obs: float32 [n, B, L, d]. previous: int64 [n, B, L], the agent's macro-action before, -1 for none. hidden:
         float32 [n, B, H].
@@ -164,10 +162,10 @@ class Agents(nn.Module):
         inputs = torch.cat([self.obs_scale * obs, one_hot], -1)
         encoded = torch.relu(self.encoder(inputs))  # [n, B, L, H]
         states = []
-        for of_input in self.gru_input(encoded).unbind(2):  # [n, B, 3 H], decision by decision
-            of_hidden = torch.bmm(hidden, self.gru_hidden)  # [n, B, 3 H]
-            reset_input, update_input, new_input = of_input.chunk(3, -1)
-            reset_hidden, update_hidden, new_hidden = of_hidden.chunk(3, -1)
+        for from_input in self.input_layer(encoded).unbind(2):  # [n, B, 3 H], decision by decision
+            from_hidden = torch.bmm(hidden, self.hidden_weight)  # [n, B, 3 H]
+            reset_input, update_input, new_input = from_input.chunk(3, -1)
+            reset_hidden, update_hidden, new_hidden = from_hidden.chunk(3, -1)
             reset = torch.sigmoid(reset_input + reset_hidden)
             update = torch.sigmoid(update_input + update_hidden)
             new = torch.tanh(new_input + reset * new_hidden)
@@ -180,13 +178,13 @@ class Agents(nn.Module):
 def utilities_at_rows(agents, batch):
     """Q_i(h_i, .) of every agent at every row of a batch, float32 [B, T, n, A].
 
-    A macro-history grows only where its own agent chooses. So an agent's network runs over its own decisions alone. At
-    a row at which the agent is busy, its utilities are those of its latest decision.
+    A macro-history grows only where its own agent chooses, so an agent's network runs over its own decisions alone.
+    At a row at which the agent is busy, its utilities are those of its latest decision.
     """
     free = batch["free"].movedim(2, 0)  # [n, B, T]
     decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
-    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], the rows of the agent's decisions come first
-    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L]
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], for some agents with busy rows, which nobody reads
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
     utilities, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
@@ -204,7 +202,7 @@ def mix(utilities, actions):
 class ReplayBuffer:
     """Episodes as rows (Fig. 2): those that run in the N environments, and the last `capacity` that have ended.
 
-    A row is a record of a NumPy structured array. Its fields are the columns of Fig. 2.
+    A row is a record of a NumPy structured array.
     """
 
     def __init__(self, env, capacity):
@@ -214,8 +212,8 @@ class ReplayBuffer:
             ("available", bool, (n_agents, max(env.n_actions))),  # what it can do
             ("action", np.int64, (n_agents,)),  # the macro-action that it runs from here on
             ("since", np.int64, (n_agents,)),  # the row at which it chose that macro-action
-            ("reward", np.float32),  # the sum of gamma^t r_t until the next row
-            ("discount", np.float32),  # gamma^tau, or 0 if the episode terminates before the next row
+            ("reward", np.float32),  # the sum of gamma^t r_t over the tau steps until the next row
+            ("discount", np.float32),  # gamma^tau, or 0 if the episode terminates at the next row
         ]
         # An episode has at most a row for each step, and a last one for its final observation.
         self.running = np.zeros((env.num_envs, env.horizon + 1), np.dtype(fields, align=True))
@@ -225,11 +223,11 @@ class ReplayBuffer:
     def begin_rows(self, obs, infos, actions, free):
         """Begins a row in every environment in which an agent is free.
 
-        obs, infos: of the environments. actions: int64 [N, n], what agents run from now on. free: bool [N, n].
+        obs, infos: of the last reset or step. actions: int64 [N, n], what agents run from now on. free: bool [N, n].
         """
-        e = np.flatnonzero(free.any(1))  # environments
-        k = self.running_rows[e]  # the numbers of their new rows
-        since_before = self.running["since"][e, k - 1]  # of no meaning at row 0, where all agents are free
+        e = np.flatnonzero(free.any(1))  # the environments that get a row
+        k = self.running_rows[e]  # and its number
+        since_before = self.running["since"][e, k - 1]  # not used at row 0, where all agents are free
         rows = np.zeros(len(e), self.running.dtype)
         rows["obs"] = obs[e]
         rows["available"] = infos["available"][e]
@@ -240,7 +238,7 @@ class ReplayBuffer:
         self.running_rows[e] += 1
 
     def add_step(self, rewards, discounts):
-        """Adds a time step to the rows that run.
+        """Adds a time step to the latest row of every running episode.
 
         rewards: float64 [N]. discounts: float64 [N], gamma, or 0 where the step terminated the episode.
         """
@@ -251,16 +249,15 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves the episodes in over, bool [N], to the ended ones, with a last row for what the agents see then."""
+        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
         self.running_rows[over] = 0
 
-    def sample(self, batch_size, rng, device="cpu"):
-        """A batch of random ended episodes, see make_batch."""
-        numbers = rng.integers(len(self.ended), size=batch_size)
-        return make_batch([self.ended[number] for number in numbers], device)
+    def sample(self, batch_size, rng):
+        """Random ended episodes, drawn with replacement: a list of arrays of rows."""
+        return [self.ended[number] for number in rng.integers(len(self.ended), size=batch_size)]
 
     def state_dict(self):
         """The rows that were written, for each episode as a tensor of bytes."""
@@ -281,30 +278,30 @@ class ReplayBuffer:
 
 
 def make_batch(episodes, device="cpu"):
-    """Episodes as tensors [B, T, ...], one for each field of a row, and these. Shorter episodes repeat their last row.
+    """Tensors [B, T, ...]: the fields of a row, and those below. Shorter episodes repeat their final row.
 
-    valid: bool [B, T], rows that have a next one. free: bool [B, T, n], agents that choose at the row. previous: int64
-    [B, T, n], the macro-action before the one that an agent runs, -1 for none.
+    valid: bool [B, T], false at an episode's final row and its repeats. free: bool [B, T, n], agents that choose at the
+    row. previous: int64 [B, T, n], what an agent ran before its present macro-action, -1 for nothing.
     """
     length = np.array([len(episode) for episode in episodes])  # [B]
     row = np.arange(length.max())  # [T]
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    before = np.take_along_axis(batch["action"], since - 1, axis=1)
-    batch["valid"] = row < length[:, None] - 1  # the last row is that of the final observation
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
-    batch["previous"] = np.where(since > 0, before, -1)
+    batch["previous"] = np.where(since > 0, previous, -1)
     return {name: torch.from_numpy(array).to(device) for name, array in batch.items()}
 
 
 def td_loss(utilities, target_utilities, batch, args, hysteresis=1.0):
-    """The loss of Eq. 14, and the joint values and their targets, float32 [rows that have a next one].
+    """The loss of Eq. 14, and the joint values and their targets, float32 [number of valid rows].
 
     utilities, target_utilities: float32 [B, T, n, A], of the online and of the target networks.
     """
     choices = utilities.masked_fill(~batch["available"], -torch.inf)
-    best = choices.argmax(-1)  # [B, T, n], the conditional argmax
+    best = choices.argmax(-1)  # [B, T, n], m*
     free = batch["free"][..., None]
     if args.ongoing == "detach":
         utilities = torch.where(free, utilities, utilities.detach())
@@ -316,7 +313,7 @@ def td_loss(utilities, target_utilities, batch, args, hysteresis=1.0):
         next_q = mix(target_utilities, best)[:, 1:]  # [B, T - 1]
         reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
         target = reward + discount * next_q
-        # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1]), with lambda = 0 at the final row k + 1
+        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]). A final row has no y.
         for k in reversed(range(target.shape[1] - 1)):
             bootstrap = torch.lerp(next_q[:, k], target[:, k + 1], args.td_lambda * valid[:, k + 1])
             target[:, k] = reward[:, k] + discount[:, k] * bootstrap
@@ -326,23 +323,23 @@ def td_loss(utilities, target_utilities, batch, args, hysteresis=1.0):
 
 
 def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
-    """Epsilon-greedy macro-actions int64 [N, n], where a busy agent's is the one it runs, and new hidden states.
+    """Epsilon-greedy macro-actions int64 [N, n] and new hidden states. A busy agent can only go on.
 
-    obs: float32 [N, n, d]. infos: those of the last reset or step. hidden: float32 [n, N, H]; that of an agent changes
-    where it is free.
+    obs: float32 [N, n, d]. infos: those of the last reset or step. hidden: float32 [n, N, H]; only those of free
+    agents change.
     """
     free = infos["macro_done"]
     available = infos["available"]
     own_obs = torch.from_numpy(obs).to(hidden.device).transpose(0, 1)[:, :, None]  # [n, N, 1, d]
-    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)  # a free agent's last one
+    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)  # used where free
     with torch.no_grad():
         utilities, new_hidden = agents(own_obs, previous, hidden)
-    moves = torch.from_numpy(free.T[..., None]).to(hidden.device)  # [n, N, 1]
-    hidden = torch.where(moves, new_hidden, hidden)
+    is_free = torch.from_numpy(free.T[..., None]).to(hidden.device)  # [n, N, 1]
+    hidden = torch.where(is_free, new_hidden, hidden)
     utilities = utilities[:, :, 0].transpose(0, 1).cpu().numpy()  # [N, n, A]
     actions = np.where(available, utilities, -np.inf).argmax(2)
     if epsilon > 0:
-        random_actions = np.where(available, rng.random(available.shape), -1.0).argmax(2)
+        random_actions = np.where(available, rng.random(available.shape), -1.0).argmax(2)  # uniform
         explores = rng.random(free.shape) < epsilon
         actions = np.where(explores, random_actions, actions)
     return actions, hidden
@@ -362,11 +359,11 @@ def evaluate(agents, env, gamma, seed):
         result["return"] += running * rewards
         result["discounted_return"] += running * gamma**step * rewards
         result["length"] += running
-        result["success"] += running & infos["success"]
+        result["success"] += running & infos["success"]  # true in one step of an episode at most
         over = terminations | truncations
         running &= ~over
         step += 1
-        obs, infos = env.reset(options={"reset_mask": over})  # ended environments play on, nobody looks
+        obs, infos = env.reset(options={"reset_mask": over})  # the next ones do not count
         hidden[:, over] = 0.0
     return result
 
@@ -374,34 +371,39 @@ def evaluate(agents, env, gamma, seed):
 def make_learner(args, env):
     """The agents' networks, in a module on the device."""
     obs_size = env.single_observation_space.shape[1]
-    n_actions = max(env.n_actions)
-    agents = Agents(env.n_agents, n_actions, obs_size, args.hidden_size, args.obs_scale)
+    agents = Agents(env.n_agents, max(env.n_actions), obs_size, args.hidden_size, args.obs_scale)
     return nn.ModuleDict({"agents": agents}).to(args.device)
 
 
 def train(args):
     """Trains, or goes on with the run in args.resume, and returns the run's folder."""
     torch.set_num_threads(1)  # fastest for networks of this size
-    # Each purpose has a seed of its own, so that no two of them draw the same random numbers.
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda: there is none")
     seeds = np.random.SeedSequence(args.seed).generate_state(5, np.uint64).tolist()
-    torch.manual_seed(seeds[0])
-    explore_rng = np.random.default_rng(seeds[1])
-    replay_rng = np.random.default_rng(seeds[2])
+    network_seed, explore_seed, replay_seed, env_seed, eval_seed = seeds  # no two purposes share random numbers
+    torch.manual_seed(network_seed)
+    explore_rng = np.random.default_rng(explore_seed)
+    replay_rng = np.random.default_rng(replay_seed)
     env = envs.make(args.env, args.num_envs)
     eval_env = envs.make(args.env, args.eval_episodes)
     learner = make_learner(args, env)
-    target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, which follow slowly
+    target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, without gradients
     optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
     buffer = ReplayBuffer(env, args.buffer_size)
-    parts = {"learner": learner, "target": target, "optimizer": optimizer, "buffer": buffer}
-    obs, infos = env.reset(seed=seeds[3])
+    parts = {
+        "learner": learner,
+        "target": target,
+        "optimizer": optimizer,
+        "buffer": buffer,
+    }
+    obs, infos = env.reset(seed=env_seed)
     hidden = learner["agents"].start(args.num_envs)
     step = 0
     updates = 0
     best_return = -np.inf
-
-    name = f"{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}"
-    folder = Path(args.resume or f"{args.runs_dir}/{name}")
+    run_name = f"{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}".replace(":", "-")
+    folder = Path(args.resume or f"{args.runs_dir}/{run_name}")
     if args.resume:
         saved = load(folder / "checkpoint.pt")
         for name, part in parts.items():
@@ -417,15 +419,15 @@ def train(args):
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    writer = SummaryWriter(folder, purge_step=step + 1)
-    print(f"run folder: {folder}", file=sys.stderr)
-    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
+    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    print(folder)
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
     saved_at = -np.inf  # so there is a checkpoint from the first step on
 
     while step < args.total_timesteps:
         # ---- act: one time step in every environment ----
-        explored = (step - args.learning_starts) / args.exploration_timesteps  # from 0 to 1 while epsilon falls
-        epsilon = np.interp(explored, [0, 1], [1.0, args.end_e])
+        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
         actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
         buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
@@ -439,14 +441,14 @@ def train(args):
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
 
-        # ---- learn: an update whenever train_frequency time steps have been taken ----
+        # ---- learn: an update for each multiple of train_frequency that was just passed ----
         due = step // args.train_frequency - (step - args.num_envs) // args.train_frequency
-        can_learn = step > args.learning_starts and len(buffer.ended) > 0
+        can_learn = step > args.learning_starts and buffer.ended
         for _ in range(due if can_learn else 0):
             if args.anneal_lr:
-                optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - step / args.total_timesteps)
-            hysteresis = np.interp(explored, [1, 2], [args.hysteresis, 1.0])
-            batch = buffer.sample(args.batch_size, replay_rng, args.device)
+                optimizer.param_groups[0]["lr"] = args.learning_rate * max(0.0, 1 - step / args.total_timesteps)
+            hysteresis = np.interp(phase, [1, 2], [args.hysteresis, 1.0])
+            batch = make_batch(buffer.sample(args.batch_size, replay_rng), args.device)
             utilities = utilities_at_rows(learner["agents"], batch)
             target_utilities = utilities_at_rows(target["agents"], batch)
             loss, joint_q, _ = td_loss(utilities, target_utilities, batch, args, hysteresis)
@@ -462,14 +464,13 @@ def train(args):
                 writer.add_scalar("losses/q_values", joint_q.mean(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # ---- log, evaluate, save ----
-        if step % 2_000 < args.num_envs:
-            writer.add_scalar("charts/epsilon", epsilon, step)
+        # ---- evaluate, log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
-            episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=seeds[4] + step)
+            episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
             result = {name: values.mean().item() for name, values in episodes.items()}
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)
+            writer.add_scalar("charts/epsilon", epsilon, step)
             bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
             model = dict(step=step, networks=learner.state_dict(), **result)
             save(folder / "last.pt", args, **model)
@@ -477,7 +478,7 @@ def train(args):
                 best_return = result["return"]
                 save(folder / "best.pt", args, **model)
         if time.monotonic() - saved_at > args.checkpoint_frequency:
-            writer.flush()  # what was logged up to here is not logged again after a resume
+            writer.flush()  # what was logged up to here outlives a kill
             save(
                 folder / "checkpoint.pt",
                 args,
@@ -507,14 +508,14 @@ def load(path):
         saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
         if saved["algorithm"] != ALGORITHM:
             raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
-        Args(**saved["args"])  # fails where a setting is not one of this version
+        Args(**saved["args"])  # raises TypeError if a setting is of another version
         return saved
-    except Exception as error:  # torch names no common class for what a damaged file raises
+    except Exception as error:  # a damaged file raises errors of many classes
         raise SystemExit(f"cannot read {path}: {error}".splitlines()[0]) from None
 
 
 def parse_args(argv=None):
-    """Args from the command line, over the defaults of the task, or the settings of the run to go on with."""
+    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
@@ -523,19 +524,19 @@ def parse_args(argv=None):
         if known.env or others:
             raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
         saved = load(Path(known.resume) / "checkpoint.pt")
-        return Args(**saved["args"] | {"resume": known.resume})
+        return Args(**{**saved["args"], "resume": known.resume})
     env = known.env or Args.env
-    task_defaults = {}
+    defaults = {}
     for beginning, values in DEFAULTS.items():
         if env.startswith(beginning):
-            task_defaults = values
-    return tyro.cli(Args, default=Args(env=env, **task_defaults), args=argv)
+            defaults = values
+    return tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
 
 
 if __name__ == "__main__":
     args = parse_args()
     try:
-        print(train(args))
+        train(args)
     except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
         raise SystemExit(error) from None
     except KeyboardInterrupt:

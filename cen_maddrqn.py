@@ -1,29 +1,35 @@
 """Cen-MADDRQN: one recurrent Q-network over the team's joint macro-history and joint macro-actions.
 
-The fully centralised baseline of Xiao et al. (2020, "Macro-action-based deep multi-agent reinforcement learning"), in
-Section 2.2 of the paper. It sees every macro-observation and chooses for every free agent: an upper bound on what there
-is to know, but exponential in the number of agents, and nothing that agents could execute on their own.
+This is the fully centralised baseline of Xiao et al. (2020, "Macro-action-based deep multi-agent reinforcement
+learning"). "The paper" below is "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning", which
+describes it in Section 2.2. It sees every macro-observation and chooses for every free agent. So it knows
+all that there is to know, but it has as many outputs as there are joint macro-actions, and agents could not execute it
+on their own. Three ideas carry the whole file:
 
-    the team as one agent   it decides at every row, that is, whenever a macro-action of any agent ends
-    macro-history           the latest macro-observation of every agent, who is free, and the macro-actions before
-    target (Eq. 5)          y = r + gamma^tau Q'(h', m*), m* the best joint macro-action that leaves the macro-actions
-                            of ongoing agents as they are: the conditional argmax
+    row        A time step at which at least one agent is free and starts a macro-action. The team decides at every row.
+    available  A joint macro-action is available if each of its parts is. A free agent's part is a macro-action that it
+               can start, a busy agent's part is the one that it runs.
+    target     y = r + gamma^tau Q'(h', m*) (Eq. 5), tau steps later, at the next row. Q' is the target network, and m*
+               is the argmax of the online network over what is available there (double Q).
 
-With one agent that decides at every row, replay, loss and training loop are those of avf_vdn.py, to the letter; what is
-new is the network `Team`, whose joint macro-actions that would change an ongoing macro-action have the value -inf.
+Shapes: N environments, B episodes, T rows, n agents, A macro-actions of the agent that has most (for the others the
+rest is never available), J joint macro-actions, d numbers of a macro-observation, H hidden units.
 
-Numbered deviations from the paper and its baseline:
- 1. Discounts: gamma^tau between rows, on Box Pushing gamma once a row (--discount). Truncated episodes bootstrap.
- 2. The network is told which agents are free and the macro-actions before; the published one sees macro-observations.
- 3. Ours (docs/defaults.md): values, whole episodes, random start, Q(lambda), hysteresis, scales, falling step size.
+Numbered deviations from the paper and from the published baseline:
+ 1. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
+ 2. The network also sees who is free and each agent's latest macro-action. The published one sees macro-observations
+    alone, and it has an LSTM where this one has a GRU.
+ 3. The target network follows by Polyak averaging. The published one is copied now and then.
+ 4. Whole episodes are replayed, drawn with replacement. Targets are Q(lambda) returns. Negative TD errors count less
+    while the team explores (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
 """
 
 import argparse
 import copy
 import json
-import signal
 import sys
 import time
+from collections import deque
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -38,383 +44,423 @@ from tqdm import tqdm
 import envs
 
 ALGORITHM = Path(__file__).stem
+AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteresis")
 
 
 @dataclass
 class Args:
-    env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see envs.register
-    seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
-    total_timesteps: int = 400_000  # environment steps of the run, over all environments
+    env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
+    seed: int = 1  # of networks, exploration, replay and environments, from 0 on
+    total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
     checkpoint_frequency: float = 60.0  # seconds between checkpoints, from which --resume continues exactly
     runs_dir: str = "runs"  # folder in which each run makes its own
-    resume: str | None = None  # run folder of an interrupted run to go on with, with its own settings
+    resume: str | None = None  # folder of an interrupted run to go on with, with its own settings
     device: Literal["cpu", "cuda"] = "cpu"  # where networks learn and act
-    track: bool = False  # log to Weights & Biases too, which takes project and entity from its environment variables
+    track: bool = False  # log to Weights & Biases too
 
     # Algorithm
     learning_rate: float = 1e-3  # Adam's step size
-    learning_rate_end: float = 0.0  # share of the step size left at total_timesteps, reached linearly
-    gamma: float = 0.95  # discount factor, in [0, 1]
-    discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
+    anneal_lr: bool = True  # let it fall linearly to 0 at total_timesteps
+    gamma: float = 0.95  # discount factor of an environment step, in [0, 1]
     buffer_size: int = 2_500  # episodes in the replay buffer
     batch_size: int = 16  # episodes in an update
-    window: int = 100  # rows of an episode at most; where it begins later on, recurrent states are zeros too
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
-    learning_starts: int = 5_000  # environment steps at random before the first update
-    exploration_timesteps: int = 150_000  # steps after these over which the exploration rate falls from 1, linearly
-    end_e: float = 0.05  # exploration rate from then on
-    train_frequency: int = 64  # environment steps per gradient update
+    learning_starts: int = 5_000  # environment steps with random macro-actions, before the first update
+    exploration_timesteps: int = 100_000  # environment steps after these over which epsilon falls from 1
+    end_e: float = 0.05  # final epsilon
+    train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
-    td_lambda: float = 0.8  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors while exploring, 1 from twice as many steps on; 1: none
-    hidden_size: int = 64  # width of the agents' layers
+    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
+    hysteresis: float = 1.0  # factor on negative TD errors, which rises to 1 once epsilon has fallen
+    hidden_size: int = 64  # width of the network's layers
 
     def __post_init__(self):
-        if problem := envs.problem(self.env):
+        problem = envs.problem(self.env)
+        if problem:
             raise SystemExit(f"--env: {problem}")
-        shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis"
         for name, value in vars(self).items():
-            low = type(value) is int and name not in ("seed", "learning_starts")
-            high = 1 if name in shares.split() else float("inf")
-            if type(value) in (int, float) and not low <= value <= high:  # tyro has checked the others' types
-                raise SystemExit(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
+            low = 1 if type(value) is int and name not in ("seed", "learning_starts") else 0
+            high = 1 if name in AT_MOST_1 else 10**15
+            if type(value) in (int, float) and not low <= value <= high:
+                raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
-# Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
+# Other values for the tasks whose ids begin with the key. docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(discount="decision", learning_starts=150_000, exploration_timesteps=250_000, total_timesteps=600_000,
-               td_lambda=0.8, hysteresis=0.1),
-    "wtd-t": dict(total_timesteps=800_000, train_frequency=128),
-    "ct": dict(num_envs=128, train_frequency=256, gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8,
-               total_timesteps=600_000, eval_episodes=400),
-}  # fmt: skip
-
-
-class AgentLinear(nn.Module):
-    """A linear layer for each agent, as one batched product: [n, M, inputs] -> [n, M, outputs]."""
-
-    def __init__(self, n_agents, inputs, outputs):
-        super().__init__()
-        bound = inputs**-0.5
-        self.weight = nn.Parameter(torch.empty(n_agents, inputs, outputs).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.empty(n_agents, 1, outputs).uniform_(-bound, bound))
-
-    def forward(self, x):
-        return torch.baddbmm(self.bias, x, self.weight)
+    "bp-": dict(
+        total_timesteps=600_000,
+        learning_starts=150_000,
+        exploration_timesteps=200_000,
+        hysteresis=0.1,
+    ),
+    "wtd-d": dict(total_timesteps=300_000),
+    "wtd-t": dict(
+        total_timesteps=600_000,
+        train_frequency=128,
+    ),
+    "ct-": dict(
+        total_timesteps=600_000,
+        num_envs=128,
+        eval_episodes=400,
+        train_frequency=256,
+        gamma=0.9,
+        obs_scale=4.0,
+        reward_scale=10.0,
+    ),
+}
 
 
 class Team(nn.Module):
-    """The team's network, H = hidden_size wide: a value for each of the J joint macro-actions."""
+    """The team's network: Linear, ReLU, GRU, Linear, ReLU, Linear, with a value for each joint macro-action."""
 
     def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
-        self.n_actions, self.hidden_size, self.obs_scale = np.array(n_actions), hidden_size, obs_scale
-        self.parts = np.indices(n_actions).reshape(len(n_actions), -1).T  # [J, n], each agent's macro-action
-        bound, columns = hidden_size**-0.5, np.arange(max(n_actions))
-        one_hot = torch.tensor(self.parts[..., None] == columns, dtype=torch.float32)  # [J, n, A]
-        one_hot = nn.functional.pad(one_hot, (0, 0, 0, 0, 0, 1))  # [J + 1, n, A], zeros for -1
-        self.register_buffer("one_hot", one_hot, persistent=False)
-        self.encoder = AgentLinear(1, len(n_actions) * (obs_size + 1 + len(columns)), hidden_size)
-        self.gru_input = AgentLinear(1, hidden_size, 3 * hidden_size)
-        self.gru_hidden = nn.Parameter(torch.empty(1, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
-        self.head = AgentLinear(1, hidden_size, hidden_size)
-        self.output = AgentLinear(1, hidden_size, len(self.parts))
+        self.n_actions = max(n_actions)
+        self.obs_scale = obs_scale
+        # Row j lists the agents' macro-actions in joint macro-action j: numbers int64 [J, n], and one-hot [J, n * A].
+        parts = torch.from_numpy(np.indices(n_actions).reshape(len(n_actions), -1).T.copy())
+        one_hot_parts = nn.functional.one_hot(parts, self.n_actions).flatten(1).float()
+        self.register_buffer("parts", parts, persistent=False)
+        self.register_buffer("one_hot_parts", one_hot_parts, persistent=False)
+        self.encoder = nn.Linear(len(n_actions) * (obs_size + 1 + self.n_actions), hidden_size)
+        self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True)
+        self.head = nn.Linear(hidden_size, hidden_size)
+        self.output = nn.Linear(hidden_size, len(parts))
 
-    def join(self, actions):
-        """The number of a joint macro-action, int64 [...], of its parts, int64 [..., n]; -1 where they are -1."""
-        strides = torch.tensor(np.append(self.n_actions[:0:-1].cumprod()[::-1], 1), device=actions.device)
-        return torch.where(actions[..., 0] < 0, -1, (actions * strides).sum(-1))
+    def start(self, n_episodes):
+        """Hidden states before the first decision: zeros, float32 [1, B, H]."""
+        return self.output.bias.new_zeros(1, n_episodes, self.gru.hidden_size)
 
-    def start(self, count):
-        """The recurrent states before the first decisions of count episodes: zeros, float32 [n, count, H]."""
-        return self.gru_hidden.new_zeros(len(self.gru_hidden), count, self.hidden_size)
+    def forward(self, obs, free, latest, hidden):
+        """Values float32 [B, T, J] of all joint macro-actions at T rows of B episodes, and the last hidden states.
 
-    def forward(self, obs, previous, hidden, sizes):
-        """Values float32 [1, M, J], -inf for what would change an ongoing macro-action, and recurrent states [1, M, H].
-        Sequences are packed step by step: sizes[t] entries of step t, the longest first, M in all. obs: float32
-        [1, M, n * d + n], all agents' and who is free. previous: int64 [1, M], the joint macro-action before, -1 for
-        none. hidden: float32 [1, sizes[0], H]."""
-        before = self.one_hot[previous]  # [1, M, n, A]
-        inputs = torch.cat([self.obs_scale * obs, before.flatten(2)], 2)
-        gates = self.gru_input(torch.relu(self.encoder(inputs)))  # [1, M, 3 H]
-        states = []
-        for step in gates.split(sizes, 1):
-            hidden = hidden[:, : step.shape[1]]
-            in_reset, in_update, in_new = step.chunk(3, 2)  # [1, size, H] each
-            h_reset, h_update, h_new = torch.bmm(hidden, self.gru_hidden).chunk(3, 2)
-            reset, update = torch.sigmoid(in_reset + h_reset), torch.sigmoid(in_update + h_update)
-            hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
-            states.append(hidden)
-        states = torch.cat(states, 1)  # [1, M, H]
-        ongoing = 1 - obs[..., -before.shape[2] :]  # [1, M, n]
-        # how many ongoing macro-actions each joint macro-action leaves as they are: it must be all
-        kept = (ongoing[..., None] * before).flatten(2) @ self.one_hot[:-1].flatten(1).T  # [1, M, J]
-        changed = kept < ongoing.sum(2, keepdim=True) - 0.5  # [1, M, J]
-        return self.output(torch.relu(self.head(states))).masked_fill(changed, -torch.inf), states
+        obs: float32 [B, T, n, d]. free: bool [B, T, n]. latest: int64 [B, T, n], each agent's last macro-action, for a
+        busy agent the one it runs, -1 for none. hidden: float32 [1, B, H].
+        """
+        one_hot = nn.functional.one_hot(latest + 1, self.n_actions + 1)[..., 1:]  # zeros for none
+        inputs = torch.cat([self.obs_scale * obs.flatten(-2), free, one_hot.flatten(-2)], -1)
+        states, hidden = self.gru(torch.relu(self.encoder(inputs)), hidden)  # [B, T, H]
+        return self.output(torch.relu(self.head(states))), hidden
+
+    def all_available(self, available):
+        """Which joint macro-actions are available, bool [..., J]. available: bool [..., n, A], what agents can do."""
+        n_available = available.flatten(-2).float() @ self.one_hot_parts.T  # [..., J], how many parts are available
+        return n_available == available.shape[-2]
+
+    def index(self, actions):
+        """The index j of a joint macro-action, int64 [...]. actions: int64 [..., n]."""
+        one_hot = nn.functional.one_hot(actions, self.n_actions).flatten(-2).float()  # [..., n * A]
+        n_equal = one_hot @ self.one_hot_parts.T  # [..., J], how many parts are equal
+        return n_equal.argmax(-1)
 
 
-def over_rows(batch, *networks):
-    """Utilities float32 [B, T, n, A] of each network at the rows of a batch.
-    A macro-history moves where its agent chooses: networks run over own decisions, packed; rows look up the last."""
-    chosen = batch["chosen"].movedim(2, 0)  # [n, B, T]
-    step = chosen.cumsum(2) - chosen[..., :1].int()  # [n, B, T], a window begins with what its agents saw last
-    length = step[..., -1:]  # [n, B, 1]
-    rank = length.argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # [n, B, 1]
-    sizes = (length >= torch.arange(step.shape[2], device=step.device)).sum(1).amax(0)  # [T]
-    entry = (sizes.cumsum(0) - sizes)[step] + rank  # [n, B, T], where the latest decision is packed
-    agents = torch.arange(len(step), device=step.device)[:, None, None]
-    obs = batch["obs"].new_zeros(len(step), int(sizes.sum()), batch["obs"].shape[3])  # [n, M, d]
-    previous = batch["previous"].new_zeros(obs.shape[:2])  # [n, M]
-    obs[agents, entry] = batch["obs"].movedim(2, 0)  # rows with the same latest decision write the same
-    previous[agents, entry] = batch["previous"].movedim(2, 0)
-    sizes = sizes[sizes > 0].tolist()
-    return [net(obs, previous, net.start(sizes[0]), sizes)[0][agents, entry].movedim(0, 2) for net in networks]
-
-
-def team_batch(batch, team):
-    """The batch of the team as one agent, which decides at every row."""
-    inside = (batch["valid"] | batch["valid"].roll(1, 1))[..., None]  # [B, T, 1], with the row after the window
-    last = (inside.cumsum(1) - 1).expand_as(batch["chosen"])  # [B, T, n], beyond the window that at its end
-    free = batch["chosen"].gather(1, last)  # [B, T, n]
-    before = torch.where(free, batch["previous"], batch["action"])  # [B, T, n]
-    obs = torch.cat([batch["obs"].flatten(2), free], 2)[:, :, None]  # [B, T, 1, n * d + n]
-    action, previous = team.join(batch["action"])[..., None], team.join(before)[..., None]  # [B, T, 1]
-    return batch | dict(obs=obs, action=action, previous=previous, chosen=inside)
+def values_at_rows(team, batch):
+    """Values of all joint macro-actions at every row of a batch, float32 [B, T, J]."""
+    latest = torch.where(batch["free"], batch["previous"], batch["action"])
+    values, _ = team(batch["obs"], batch["free"], latest, team.start(len(latest)))
+    return values
 
 
 class ReplayBuffer:
-    """Whole episodes of rows (Fig. 2), one array [capacity + N, horizon + 1, ...] for each field of a row.
-    writing: the N episodes that run in the environments. queue: ended ones, the oldest first, after free places."""
+    """Episodes as rows (Fig. 2): those that run in the N environments, and the last `capacity` that have ended.
+
+    A row is a record of a NumPy structured array.
+    """
 
     def __init__(self, env, capacity):
-        n, d = env.single_observation_space.shape
-        fields = {
-            "obs": (n, d),  # what every agent last saw
-            "action": (n,),  # the macro-action that it runs
-            "since": (n,),  # and since which row: its macro-history moves where that is this one
-            "reward": (),  # sum of gamma^t r_t until the next row
-            "discount": (),  # gamma^tau (1 with --discount decision), 0 where the episode terminated
+        n_agents, obs_size = env.single_observation_space.shape
+        fields = [
+            ("obs", np.float32, (n_agents, obs_size)),  # what each agent last saw
+            ("available", bool, (n_agents, max(env.n_actions))),  # what it can do
+            ("action", np.int64, (n_agents,)),  # the macro-action that it runs from here on
+            ("since", np.int64, (n_agents,)),  # the row at which it chose that macro-action
+            ("reward", np.float32),  # the sum of gamma^t r_t over the tau steps until the next row
+            ("discount", np.float32),  # gamma^tau, or 0 if the episode terminates at the next row
+        ]
+        # An episode has at most a row for each step, and a last one for its final observation.
+        self.running = np.zeros((env.num_envs, env.horizon + 1), np.dtype(fields, align=True))
+        self.running_rows = np.zeros(env.num_envs, np.int64)  # rows that each running episode has so far
+        self.ended = deque(maxlen=capacity)  # arrays of rows, one for each episode, the oldest first
+
+    def begin_rows(self, obs, infos, actions, free):
+        """Begins a row in every environment in which an agent is free.
+
+        obs, infos: of the last reset or step. actions: int64 [N, n], what agents run from now on. free: bool [N, n].
+        """
+        e = np.flatnonzero(free.any(1))  # the environments that get a row
+        k = self.running_rows[e]  # and its number
+        since_before = self.running["since"][e, k - 1]  # not used at row 0, where all agents are free
+        rows = np.zeros(len(e), self.running.dtype)
+        rows["obs"] = obs[e]
+        rows["available"] = infos["available"][e]
+        rows["action"] = actions[e]
+        rows["since"] = np.where(free[e], k[:, None], since_before)
+        rows["discount"] = 1.0
+        self.running[e, k] = rows
+        self.running_rows[e] += 1
+
+    def add_step(self, rewards, discounts):
+        """Adds a time step to the latest row of every running episode.
+
+        rewards: float64 [N]. discounts: float64 [N], gamma, or 0 where the step terminated the episode.
+        """
+        latest = np.arange(len(rewards)), self.running_rows - 1
+        rows = self.running[latest]
+        rows["reward"] += rows["discount"] * rewards
+        rows["discount"] *= discounts
+        self.running[latest] = rows
+
+    def end_episodes(self, over, obs, infos):
+        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
+        self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
+        for e in np.flatnonzero(over):
+            self.ended.append(self.running[e, : self.running_rows[e]].copy())
+        self.running_rows[over] = 0
+
+    def sample(self, batch_size, rng):
+        """Random ended episodes, drawn with replacement: a list of arrays of rows."""
+        return [self.ended[number] for number in rng.integers(len(self.ended), size=batch_size)]
+
+    def state_dict(self):
+        """The rows that were written, for each episode as a tensor of bytes."""
+        running = [self.running[e, :length] for e, length in enumerate(self.running_rows)]
+        return {
+            "running": [torch.from_numpy(rows.view(np.uint8)) for rows in running],
+            "ended": [torch.from_numpy(rows.view(np.uint8)) for rows in self.ended],
         }
-        for name, shape in fields.items():
-            kind = int if name in ("action", "since") else np.float32
-            setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
-        self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
-        self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
 
-    def add(self, obs, actions, chosen):
-        """Notes a row wherever an agent chooses: float32 [N, n, d], int64 [N, n], bool [N, n]."""
-        env = np.flatnonzero(chosen.any(1))
-        at = episode, row = self.writing[env], self.rows[self.writing[env]]
-        since = np.where(chosen[env], row[:, None], self.since[episode, row - 1])
-        self.obs[at], self.action[at], self.since[at] = obs[env], actions[env], since
-        self.reward[at], self.discount[at] = 0.0, 1.0
-        self.rows[episode] += 1
-
-    def step(self, rewards, discounts, over, obs, infos):
-        """Adds a step to the running rows, r += gamma^t r_t, and ends the episodes in over, bool [N], with a row for
-        their final observation. rewards, discounts: float64 [N], the latter gamma, 0 at a terminal step."""
-        at = self.writing, self.rows[self.writing] - 1
-        self.reward[at] += self.discount[at] * rewards
-        self.discount[at] *= discounts
-        self.add(obs, infos["macro_action"], infos["macro_done"] & over[:, None])
-        self.writing[over], self.queue = np.split(np.append(self.queue, self.writing[over]), [over.sum()])
-        self.rows[self.writing[over]] = 0
-
-    def sample(self, batch_size, window, rng, device="cpu"):
-        """Random episodes, of longer ones a window: tensors [B, T, ...] by name, `valid` marks rows with a next one.
-        Windows reach over both ends and are cut there: every row of an episode is as likely as any other."""
-        episode = rng.choice(self.queue[self.rows[self.queue] > 0], (batch_size, 1))
-        last = self.rows[episode] - 1  # [B, 1], the row of the final observation
-        start = (last > window) * rng.integers(1 - window, last)  # 0 where the whole episode fits
-        end = np.minimum(start + window, last)
-        row = np.maximum(start, 0) + np.arange(min(window, last.max()) + 1)  # [B, T]
-        at = episode, np.minimum(row, end)
-        since = self.since[at]  # [B, T, n]
-        before = episode[..., None], since - 1, np.arange(since.shape[2])
-        batch = {key: getattr(self, key)[at] for key in ("obs", "action", "reward", "discount")}
-        previous = np.where(since > 0, self.action[before], -1)  # [B, T, n]
-        batch |= dict(valid=row < end, chosen=since == row[..., None], previous=previous)
-        return {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
+    def load_state_dict(self, saved):
+        """Goes on with what `state_dict` returned."""
+        for e, in_bytes in enumerate(saved["running"]):
+            rows = in_bytes.numpy().view(self.running.dtype)
+            self.running[e, : len(rows)] = rows
+            self.running_rows[e] = len(rows)
+        for in_bytes in saved["ended"]:
+            self.ended.append(in_bytes.numpy().view(self.running.dtype))
 
 
-def td_loss(utilities, target_utilities, batch, td_lambda=0.0, hysteresis=1.0):
-    """The loss of Eq. 5, with double Q-learning; values and targets float32 [R] of the R valid rows of a team's batch.
-    utilities, target_utilities: float32 [B, T, 1, J]. td_lambda: 0 for one-row targets, up to 1.
-    hysteresis: factor on negative TD errors, 1 for none."""
-    here = batch["valid"]  # [B, T], rows that have a next one
-    there = here.roll(1, 1)  # [B, T], the rows after them: a window's last row has none
-    chosen, action = batch["chosen"], batch["action"]  # [B, T, n]
-    taken = utilities.gather(3, action[..., None])[..., 0]  # [B, T, n]
-    q = taken[here].squeeze(1)  # [R]
+def make_batch(episodes, device="cpu"):
+    """Tensors [B, T, ...]: the fields of a row, and those below. Shorter episodes repeat their final row.
+
+    valid: bool [B, T], false at an episode's final row and its repeats. free: bool [B, T, n], agents that choose at the
+    row. previous: int64 [B, T, n], what an agent ran before its present macro-action, -1 for nothing.
+    """
+    length = np.array([len(episode) for episode in episodes])  # [B]
+    row = np.arange(length.max())  # [T]
+    rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
+    batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
+    since = batch["since"]  # [B, T, n]
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    batch["valid"] = row < length[:, None] - 1
+    batch["free"] = since == row[:, None]
+    batch["previous"] = np.where(since > 0, previous, -1)
+    return {name: torch.from_numpy(array).to(device) for name, array in batch.items()}
+
+
+def td_loss(values, target_values, team, batch, args, hysteresis=1.0):
+    """The loss of Eq. 5, and the values and their targets, float32 [number of valid rows].
+
+    values, target_values: float32 [B, T, J], of the online and of the target network.
+    """
+    q = values.gather(-1, team.index(batch["action"])[..., None])[:, :-1, 0]  # [B, T - 1]
     with torch.no_grad():
-        # The conditional argmax: joint macro-actions that would change an ongoing one have the value -inf.
-        best = torch.where(chosen, utilities.argmax(3), action)  # [B, T, n]
-        best_q = target_utilities.gather(3, best[..., None])[..., 0]  # [B, T, n]
-        bootstrap = best_q[there].squeeze(1)  # [R]
-        following = torch.zeros_like(batch["reward"]).masked_scatter(here, bootstrap)  # [B, T]
-        returns = list((batch["reward"] + batch["discount"] * following).unbind(1))  # one-row ones, [B] each
-        longer = (td_lambda * batch["discount"] * here.roll(-1, 1)).unbind(1)  # none beyond a window's last row
-        # G[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda G[k + 1])
-        for k in reversed(range(len(returns) - 1) if td_lambda else ()):
-            returns[k] = torch.addcmul(returns[k], longer[k], returns[k + 1] - following[:, k])
-        target = torch.stack(returns, 1)[here]  # [R]
-    error = target - q
-    return torch.where(error < 0, hysteresis * error, error).square().mean(), q, target
+        choices = values.masked_fill(~team.all_available(batch["available"]), -torch.inf)
+        best = choices.argmax(-1)  # [B, T], m*
+        next_q = target_values.gather(-1, best[..., None])[:, 1:, 0]  # [B, T - 1]
+        reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
+        target = reward + discount * next_q
+        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]). A final row has no y.
+        for k in reversed(range(target.shape[1] - 1)):
+            bootstrap = torch.lerp(next_q[:, k], target[:, k + 1], args.td_lambda * valid[:, k + 1])
+            target[:, k] = reward[:, k] + discount[:, k] * bootstrap
+    error = (target - q)[valid]
+    error = torch.where(error < 0, hysteresis * error, error)
+    return error.square().mean(), q[valid], target[valid]
 
 
 def act(team, obs, infos, hidden, epsilon=0.0, rng=None):
-    """Epsilon-greedy macro-actions int64 [N, n], the team's best or, with probability epsilon, random ones of all free
-    agents, and recurrent states float32 [1, N, H], moved where an agent is free. obs, float32 [N, n, d], and infos are
-    those of the environment's last reset or step."""
-    free, running = infos["macro_done"], infos["macro_action"]
-    team_obs = np.concatenate([obs.reshape(len(obs), -1), free], 1, dtype=np.float32)  # [N, n * d + n]
-    inputs = (torch.from_numpy(x).to(hidden.device)[None] for x in (team_obs, running, free.any(1)))  # [1, N, ...]
-    team_obs, before, moved = inputs
+    """Epsilon-greedy macro-actions int64 [N, n] and new hidden states. A busy agent can only go on.
+
+    With probability epsilon all free agents of an environment choose at random. obs: float32 [N, n, d]. infos: those of
+    the last reset or step. hidden: float32 [1, N, H]; it changes where an agent is free.
+    """
+    available = torch.from_numpy(infos["available"]).to(hidden.device)
+    free = torch.from_numpy(infos["macro_done"]).to(hidden.device)
+    latest = torch.from_numpy(infos["macro_action"]).to(hidden.device)
     with torch.no_grad():
-        utilities, states = team(team_obs, team.join(before), hidden, [len(obs)])
-    actions = team.parts[utilities.argmax(2)[0].cpu().numpy()]  # [N, n]
+        team_obs = torch.from_numpy(obs).to(hidden.device)
+        values, new_hidden = team(team_obs[:, None], free[:, None], latest[:, None], hidden)
+        choices = values[:, 0].masked_fill(~team.all_available(available), -torch.inf)  # [N, J]
+    hidden = torch.where(free.any(1, keepdim=True), new_hidden, hidden)  # [1, N, H]
+    actions = team.parts[choices.argmax(-1)].cpu().numpy()  # [N, n]
     if epsilon > 0:
-        explore = rng.random((len(obs), 1)) < epsilon
-        actions = np.where(explore, rng.integers(team.n_actions, size=free.shape), actions)
-    return np.where(free, actions, running), torch.where(moved[..., None], states, hidden)
+        random_actions = np.where(infos["available"], rng.random(available.shape), -1.0).argmax(2)  # uniform
+        explores = rng.random((len(obs), 1)) < epsilon
+        actions = np.where(explores, random_actions, actions)
+    return actions, hidden
 
 
 def evaluate(agents, env, gamma, seed):
-    """Greedy play: return, discounted_return, length, success of each environment's first episode, float64 [N] each."""
+    """Greedy play of one episode in each environment: return, discounted_return, length, success, float64 [N] each."""
     obs, infos = env.reset(seed=seed)
-    hidden, live, step, result = agents.start(env.num_envs), np.ones(env.num_envs, bool), 0, {}
-    while live.any():
+    hidden = agents.start(env.num_envs)
+    running = np.ones(env.num_envs, bool)
+    names = ("return", "discounted_return", "length", "success")
+    result = {name: np.zeros(env.num_envs) for name in names}
+    step = 0
+    while running.any():
         actions, hidden = act(agents, obs, infos, hidden)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        new = {"return": rewards, "discounted_return": gamma**step * rewards, "length": 1, "success": infos["success"]}
-        result = {key: result.get(key, 0.0) + live * value for key, value in new.items()}
+        result["return"] += running * rewards
+        result["discounted_return"] += running * gamma**step * rewards
+        result["length"] += running
+        result["success"] += running & infos["success"]  # true in one step of an episode at most
         over = terminations | truncations
-        live &= ~over
+        running &= ~over
         step += 1
-        obs, infos = env.reset(options={"reset_mask": over})  # play on in ended environments without looking
+        obs, infos = env.reset(options={"reset_mask": over})  # the next ones do not count
         hidden[:, over] = 0.0
     return result
 
 
 def make_learner(args, env):
-    """The team's network in a module on the device."""
-    if (joint := np.prod(env.n_actions, dtype=float)) > 2**15:
-        raise SystemExit(f"{args.env} has {joint:,.0f} joint macro-actions, the limit is {2**15:,}")
-    team = Team(env.n_actions, env.single_observation_space.shape[1], args.hidden_size, args.obs_scale)
+    """The team's network, under the name that it has in all scripts, on the device."""
+    n_joint_actions = np.prod(env.n_actions, dtype=float)
+    if n_joint_actions > 2**15:
+        raise SystemExit(f"{args.env} has {n_joint_actions:,.0f} joint macro-actions, the limit is {2**15:,}")
+    obs_size = env.single_observation_space.shape[1]
+    team = Team(env.n_actions, obs_size, args.hidden_size, args.obs_scale)
     return nn.ModuleDict({"agents": team}).to(args.device)
 
 
-def train(args, stop=()):
-    """Trains from Args, or goes on with the run args.resume, until something is in stop; returns the run folder."""
+def train(args):
+    """Trains, or goes on with the run in args.resume, and returns the run's folder."""
     torch.set_num_threads(1)  # fastest for networks of this size
-    torch.manual_seed(args.seed)
-    rng = np.random.default_rng(args.seed)
-    env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda: there is none")
+    seeds = np.random.SeedSequence(args.seed).generate_state(5, np.uint64).tolist()
+    network_seed, explore_seed, replay_seed, env_seed, eval_seed = seeds  # no two purposes share random numbers
+    torch.manual_seed(network_seed)
+    explore_rng = np.random.default_rng(explore_seed)
+    replay_rng = np.random.default_rng(replay_seed)
+    env = envs.make(args.env, args.num_envs)
+    eval_env = envs.make(args.env, args.eval_episodes)
     learner = make_learner(args, env)
-    target, agents = copy.deepcopy(learner).requires_grad_(False), learner["agents"]
-    fast, slow = list(learner.parameters()), list(target.parameters())
-    optimizer = torch.optim.Adam(fast, lr=args.learning_rate, fused=True)
+    target = copy.deepcopy(learner).requires_grad_(False)  # the target network, without gradients
+    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
     buffer = ReplayBuffer(env, args.buffer_size)
-    step_gamma, row_gamma = (args.gamma, 1.0) if args.discount == "step" else (1.0, args.gamma)
-    obs, infos = env.reset(seed=args.seed)
-    hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
-    folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
+    parts = {
+        "learner": learner,
+        "target": target,
+        "optimizer": optimizer,
+        "buffer": buffer,
+    }
+    obs, infos = env.reset(seed=env_seed)
+    hidden = learner["agents"].start(args.num_envs)
+    step = 0
+    updates = 0
+    best_return = -np.inf
+    run_name = f"{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}".replace(":", "-")
+    folder = Path(args.resume or f"{args.runs_dir}/{run_name}")
+    if args.resume:
+        saved = load(folder / "checkpoint.pt")
+        for name, part in parts.items():
+            part.load_state_dict(saved[name])
+        obs, infos = env.load_state(saved["env"])
+        hidden = saved["hidden"].to(args.device)
+        explore_rng.bit_generator.state, replay_rng.bit_generator.state = saved["rngs"]
+        step, updates, best_return = saved["progress"]
+    else:
+        folder.mkdir(parents=True)
+        (folder / "args.json").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
     if args.track:
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    if args.resume:
-        saved = load(folder / "checkpoint.pt")
-        for part, state in zip((learner, target, optimizer), saved["parts"], strict=True):
-            part.load_state_dict(state)
-        vars(buffer).update({key: value.numpy() for key, value in saved["buffer"].items()})
-        obs, infos = env.load_state(saved["env"])
-        rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
-        step, updates, recent, best = saved["counts"]
-    else:
-        folder.mkdir(parents=True)
-        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
-        (folder / "args.json.new").replace(folder / "args.json")
-    writer = SummaryWriter(folder, purge_step=step + 1)
-    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
-    time0, step0, saved_at = time.time(), step, time.time()
-
-    def log(group, **values):
-        for key, value in values.items():
-            writer.add_scalar(f"{group}/{key}", value, step)
+    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    print(folder)
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
+    saved_at = -np.inf  # so there is a checkpoint from the first step on
 
     while step < args.total_timesteps:
-        # Choose and step
-        epsilon = np.interp(step - args.learning_starts, [0, args.exploration_timesteps], [1.0, args.end_e])
-        done = step / args.total_timesteps
-        optimizer.param_groups[0]["lr"] = args.learning_rate * (1 + done * (args.learning_rate_end - 1))
-        actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
-        buffer.add(obs, actions, infos["macro_done"])
+        # ---- act: one time step in every environment ----
+        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
+        actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
+        buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over = terminations | truncations
-        buffer.step(args.reward_scale * rewards, step_gamma * ~terminations, over, obs, infos)
+        buffer.add_step(args.reward_scale * rewards, np.where(terminations, 0.0, args.gamma))
         step += args.num_envs
         bar.update(args.num_envs)
+        over = terminations | truncations
         if over.any():
-            recent += env.episode_return[over].tolist()
+            buffer.end_episodes(over, obs, infos)
+            writer.add_scalar("charts/episodic_return", env.episode_return[over].mean(), step)
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
 
-        # Learn
-        while updates < (step - args.learning_starts) // args.train_frequency and buffer.rows[buffer.queue].any():
-            batch = team_batch(buffer.sample(args.batch_size, args.window, rng, args.device), agents)
-            batch["discount"] *= row_gamma
-            utilities = over_rows(batch, agents, target["agents"])
-            beta = np.interp((step - args.learning_starts) / args.exploration_timesteps, [1, 2], [args.hysteresis, 1.0])
-            loss, joint_q, _ = td_loss(*utilities, batch, args.td_lambda, beta)
+        # ---- learn: an update for each multiple of train_frequency that was just passed ----
+        due = step // args.train_frequency - (step - args.num_envs) // args.train_frequency
+        can_learn = step > args.learning_starts and buffer.ended
+        for _ in range(due if can_learn else 0):
+            if args.anneal_lr:
+                optimizer.param_groups[0]["lr"] = args.learning_rate * max(0.0, 1 - step / args.total_timesteps)
+            hysteresis = np.interp(phase, [1, 2], [args.hysteresis, 1.0])
+            batch = make_batch(buffer.sample(args.batch_size, replay_rng), args.device)
+            values = values_at_rows(learner["agents"], batch)
+            target_values = values_at_rows(target["agents"], batch)
+            loss, q, _ = td_loss(values, target_values, learner["agents"], batch, args, hysteresis)
             optimizer.zero_grad()
             loss.backward()
-            grad_norm = nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
+            grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
             optimizer.step()
-            torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)(slow, fast, None)
+            for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
+                slow.lerp_(fast.detach(), 1 - args.polyak)
             updates += 1
             if updates % 100 == 0:
-                log("losses", td_loss=loss, q_values=joint_q.mean(), grad_norm=grad_norm)
+                writer.add_scalar("losses/td_loss", loss, step)
+                writer.add_scalar("losses/q_values", q.mean(), step)
+                writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # Log, evaluate, save
-        if step % 2_000 < args.num_envs and recent:
-            log("charts", SPS=(step - step0) / (time.time() - time0), epsilon=epsilon, episodic_return=np.mean(recent))
-            recent = []
+        # ---- evaluate, log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
-            seed = args.seed * 10**9 + step  # fresh episodes
-            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, seed).items()}
-            log("eval", **result)
+            episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
+            result = {name: values.mean().item() for name, values in episodes.items()}
+            for name, value in result.items():
+                writer.add_scalar(f"eval/{name}", value, step)
+            writer.add_scalar("charts/epsilon", epsilon, step)
+            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
             model = dict(step=step, networks=learner.state_dict(), **result)
             save(folder / "last.pt", args, **model)
-            if result["return"] >= best:
-                best = result["return"]
+            if result["return"] >= best_return:
+                best_return = result["return"]
                 save(folder / "best.pt", args, **model)
-            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
-        if time.time() - saved_at > args.checkpoint_frequency or stop:
-            writer.flush()  # what was logged up to here is not logged again after a resume
-            arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
-            parts = [part.state_dict() for part in (learner, target, optimizer)]
-            memory = {key: torch.from_numpy(value) for key, value in vars(buffer).items()}
-            save(folder / "checkpoint.pt", args, parts=parts, buffer=memory, env=arrays, hidden=hidden,
-                 rng=rng.bit_generator.state, counts=(step, updates, recent, best))  # fmt: skip
-            saved_at = time.time()
-            if stop:
-                break
+        if time.monotonic() - saved_at > args.checkpoint_frequency:
+            writer.flush()  # what was logged up to here outlives a kill
+            save(
+                folder / "checkpoint.pt",
+                args,
+                **{name: part.state_dict() for name, part in parts.items()},
+                env={name: torch.from_numpy(array) for name, array in env.save_state().items()},
+                hidden=hidden,
+                rngs=(explore_rng.bit_generator.state, replay_rng.bit_generator.state),
+                progress=(step, updates, best_return),
+            )
+            saved_at = time.monotonic()
 
     bar.close()
     writer.close()
-    if step >= args.total_timesteps:
-        (folder / "checkpoint.pt").unlink(missing_ok=True)
+    (folder / "checkpoint.pt").unlink(missing_ok=True)
     return folder
 
 
 def save(path, args, **content):
-    """Writes beside the file and swaps, so that a kill at any moment leaves the old one or the new one."""
+    """Writes beside the file and swaps, so that a kill at any moment leaves the old file or the new one."""
     torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, f"{path}.new")
     Path(f"{path}.new").replace(path)
 
@@ -425,38 +471,37 @@ def load(path):
         saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
         if saved["algorithm"] != ALGORITHM:
             raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
-        Args(**saved["args"])  # fails where a setting is not one of this version
+        Args(**saved["args"])  # raises TypeError if a setting is of another version
         return saved
-    except Exception as error:  # torch names no common class for what a damaged file raises
+    except Exception as error:  # a damaged file raises errors of many classes
         raise SystemExit(f"cannot read {path}: {error}".splitlines()[0]) from None
 
 
 def parse_args(argv=None):
-    """Args from the command line, over the defaults of the task or the settings of the run to go on with."""
+    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
     known, others = peek.parse_known_args(argv)
-    if known.resume and (known.env or others):
-        raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
     if known.resume:
-        return Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
+        if known.env or others:
+            raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
+        saved = load(Path(known.resume) / "checkpoint.pt")
+        return Args(**{**saved["args"], "resume": known.resume})
     env = known.env or Args.env
-    defaults = next((row for start, row in DEFAULTS.items() if env.startswith(start)), {})
-    args = tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
-    if args.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("--device cuda: there is none")
-    return args
+    defaults = {}
+    for beginning, values in DEFAULTS.items():
+        if env.startswith(beginning):
+            defaults = values
+    return tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
 
 
 if __name__ == "__main__":
-    stop = []  # Ctrl-C or a termination signal: end between two steps, where a checkpoint is whole
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: stop.append(number))
+    args = parse_args()
     try:
-        print(folder := train(parse_args(), stop))
+        train(args)
     except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
         raise SystemExit(error) from None
-    if (folder / "checkpoint.pt").exists():
-        print(f"stopped; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
-        sys.exit(128 + stop[0])
+    except KeyboardInterrupt:
+        print("stopped; --resume with the run's folder goes on from its last checkpoint", file=sys.stderr)
+        sys.exit(130)

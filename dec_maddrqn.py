@@ -1,32 +1,39 @@
 """Dec-MADDRQN: independent recurrent Q-learners over macro-actions, each on its own transitions.
 
-The decentralised baseline of Xiao et al. (2020, "Macro-action-based deep multi-agent reinforcement learning"), in
-Section 2.2 of the paper. Every agent sums up the joint reward over its own macro-action and learns as if the others
-were part of its environment.
+This is the decentralised baseline of Xiao et al. (2020, "Macro-action-based deep multi-agent reinforcement learning").
+The paper "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning" describes it in Section 2.2. Every
+agent sums up the team's reward over its own macro-action. It learns as if the others were part of its environment.
+Three ideas carry the whole file:
 
-    transition of agent i   from a row where it chose to the next row where it chooses: r_i = sum of gamma^t r_t over
-                            its own macro-action of tau_i steps, whatever the others start or end in between
-    target                  y_i = r_i + gamma^tau_i Q'_i(h'_i, argmax Q_i(h'_i, .))
-    hysteresis              negative TD errors are multiplied by a factor below 1, which rises: each agent stays
-                            optimistic while the others explore
+    row         A time step at which at least one agent is free and starts a macro-action. The replay buffer stores rows
+                of the whole team, as in avf_vdn.py, so all agents learn from the same episodes.
+    available   What an agent can do at a row. A free agent chooses among the macro-actions that it can start. A busy
+                agent can only go on.
+    transition  Agent i learns from the row where it chooses to the next row where it chooses. Its target is y_i = r_i +
+                gamma^tau_i Q'_i(h'_i, m*_i), with double Q, where r_i is the discounted reward of the tau_i steps of
+                its own macro-action, whatever the others start or end in between. See own_returns.
 
-The replay buffer holds joint rows like avf_vdn.py's; `own_returns` folds a window of them into each agent's own
-transitions, so that all agents learn from the same windows (concurrent experience replay).
+On Box Pushing negative TD errors count less while agents explore (--hysteresis), so an agent stays optimistic about
+what the others will do.
+
+Shapes: N environments, B episodes, T rows, L decisions of an agent, n agents, A macro-actions of the agent that has
+most (for the others the rest is never available), d numbers of a macro-observation, H hidden units.
 
 Numbered deviations from the published baseline:
- 1. An episode truncated by the horizon bootstraps from its final observation, a terminated one does not.
- 2. A macro-action that is running at the first row of a window or still running at its last gives no transition there.
- 3. One gradient norm is clipped over all agents. Their losses are summed, each a mean over the agent's transitions.
- 4. Values are ours (docs/defaults.md), as are returns over several macro-actions, scaled inputs and rewards; on Box
-    Pushing gamma counts once a row of the team (--discount), the published code once an agent's decision.
+ 1. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
+ 2. Losses are summed over agents, each a mean over the agent's transitions. One gradient norm is clipped over all.
+ 3. Agents see their previous macro-action, too. They have a GRU, where the published ones have an LSTM.
+ 4. Target networks follow by Polyak averaging. The published ones are copied now and then.
+ 5. Targets are Q(lambda) returns over several macro-actions. The published runs use hysteresis everywhere, from 0.2 to
+    0.4. docs/defaults.md explains all values.
 """
 
 import argparse
 import copy
 import json
-import signal
 import sys
 import time
+from collections import deque
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -41,65 +48,79 @@ from tqdm import tqdm
 import envs
 
 ALGORITHM = Path(__file__).stem
+AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteresis")
 
 
 @dataclass
 class Args:
-    env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see envs.register
-    seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
-    total_timesteps: int = 400_000  # environment steps of the run, over all environments
+    env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
+    seed: int = 1  # of networks, exploration, replay and environments, from 0 on
+    total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
     checkpoint_frequency: float = 60.0  # seconds between checkpoints, from which --resume continues exactly
     runs_dir: str = "runs"  # folder in which each run makes its own
-    resume: str | None = None  # run folder of an interrupted run to go on with, with its own settings
+    resume: str | None = None  # folder of an interrupted run to go on with, with its own settings
     device: Literal["cpu", "cuda"] = "cpu"  # where networks learn and act
-    track: bool = False  # log to Weights & Biases too, which takes project and entity from its environment variables
+    track: bool = False  # log to Weights & Biases too
 
     # Algorithm
     learning_rate: float = 1e-3  # Adam's step size
-    learning_rate_end: float = 0.0  # share of the step size left at total_timesteps, reached linearly
-    gamma: float = 0.95  # discount factor, in [0, 1]
-    discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
+    anneal_lr: bool = True  # let it fall linearly to 0 at total_timesteps
+    gamma: float = 0.95  # discount factor of an environment step, in [0, 1]
     buffer_size: int = 2_500  # episodes in the replay buffer
     batch_size: int = 16  # episodes in an update
-    window: int = 100  # rows of an episode at most; where it begins later on, recurrent states are zeros too
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
-    learning_starts: int = 5_000  # environment steps at random before the first update
-    exploration_timesteps: int = 150_000  # steps after these over which the exploration rate falls from 1, linearly
-    end_e: float = 0.05  # exploration rate from then on
-    train_frequency: int = 64  # environment steps per gradient update
+    learning_starts: int = 5_000  # environment steps with random macro-actions, before the first update
+    exploration_timesteps: int = 100_000  # environment steps after these over which epsilon falls from 1
+    end_e: float = 0.05  # final epsilon
+    train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
-    td_lambda: float = 0.8  # lambda of Q(lambda) returns over a window, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors while exploring, 1 from twice as many steps on; 1: none
+    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
+    hysteresis: float = 1.0  # factor on negative TD errors, which rises to 1 once epsilon has fallen
     hidden_size: int = 64  # width of the agents' layers
 
     def __post_init__(self):
-        if problem := envs.problem(self.env):
+        problem = envs.problem(self.env)
+        if problem:
             raise SystemExit(f"--env: {problem}")
-        shares = "learning_rate learning_rate_end gamma polyak end_e td_lambda hysteresis"
         for name, value in vars(self).items():
-            low = type(value) is int and name not in ("seed", "learning_starts")
-            high = 1 if name in shares.split() else float("inf")
-            if type(value) in (int, float) and not low <= value <= high:  # tyro has checked the others' types
-                raise SystemExit(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
+            low = 1 if type(value) is int and name not in ("seed", "learning_starts") else 0
+            high = 1 if name in AT_MOST_1 else 10**15
+            if type(value) in (int, float) and not low <= value <= high:
+                raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
-# Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
+# Other values for the tasks whose ids begin with the key. docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(discount="decision", learning_starts=150_000, exploration_timesteps=250_000, total_timesteps=600_000,
-               td_lambda=0.8, hysteresis=0.1),
-    "wtd-t": dict(total_timesteps=800_000, train_frequency=128),
-    "ct": dict(num_envs=128, train_frequency=256, gamma=0.9, obs_scale=4.0, reward_scale=10.0, td_lambda=0.8,
-               total_timesteps=600_000, eval_episodes=400),
-}  # fmt: skip
+    "bp-": dict(
+        total_timesteps=600_000,
+        learning_starts=150_000,
+        exploration_timesteps=200_000,
+        hysteresis=0.1,
+    ),
+    "wtd-d": dict(total_timesteps=300_000),
+    "wtd-t": dict(
+        total_timesteps=600_000,
+        train_frequency=128,
+    ),
+    "ct-": dict(
+        total_timesteps=600_000,
+        num_envs=128,
+        eval_episodes=400,
+        train_frequency=256,
+        gamma=0.9,
+        obs_scale=4.0,
+        reward_scale=10.0,
+    ),
+}
 
 
 class AgentLinear(nn.Module):
-    """A linear layer for each agent, as one batched product: [n, M, inputs] -> [n, M, outputs]."""
+    """One linear layer for each agent, as a batched product: [n, ..., inputs] -> [n, ..., outputs]."""
 
     def __init__(self, n_agents, inputs, outputs):
         super().__init__()
@@ -108,291 +129,382 @@ class AgentLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(n_agents, 1, outputs).uniform_(-bound, bound))
 
     def forward(self, x):
-        return torch.baddbmm(self.bias, x, self.weight)
+        flat = x.flatten(1, -2)  # [n, all in between, inputs]
+        return torch.baddbmm(self.bias, flat, self.weight).unflatten(1, x.shape[1:-1])
 
 
 class Agents(nn.Module):
-    """The agents' utility networks, one each: Linear, ReLU, GRU, Linear, ReLU, Linear, H = hidden_size wide."""
+    """The agents' utility networks Q_i(h_i, .): Linear, ReLU, GRU, Linear, ReLU, Linear.
 
-    def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
+    Agents share no weights, but their networks have one shape. So they run side by side, as batched products, and the
+    GRU is written out. With an nn.GRU for each agent an update would take up to twice as long.
+    """
+
+    def __init__(self, n_agents, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
-        n, widest, bound = len(n_actions), max(n_actions), hidden_size**-0.5
-        self.n_actions, self.hidden_size, self.obs_scale = np.array(n_actions), hidden_size, obs_scale
-        self.encoder = AgentLinear(n, obs_size + widest, hidden_size)
-        self.gru_input = AgentLinear(n, hidden_size, 3 * hidden_size)
-        self.gru_hidden = nn.Parameter(torch.empty(n, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
-        self.head = AgentLinear(n, hidden_size, hidden_size)
-        self.output = AgentLinear(n, hidden_size, widest)
-        padding = torch.arange(widest) >= torch.tensor(n_actions)[:, None, None]  # [n, 1, A]
-        self.register_buffer("padding", padding, persistent=False)
+        self.n_actions = n_actions
+        self.obs_scale = obs_scale
+        self.encoder = AgentLinear(n_agents, obs_size + n_actions, hidden_size)
+        self.input_layer = AgentLinear(n_agents, hidden_size, 3 * hidden_size)
+        bound = hidden_size**-0.5
+        hidden_weight = torch.empty(n_agents, hidden_size, 3 * hidden_size)  # without a bias of its own
+        self.hidden_weight = nn.Parameter(hidden_weight.uniform_(-bound, bound))
+        self.head = AgentLinear(n_agents, hidden_size, hidden_size)
+        self.output = AgentLinear(n_agents, hidden_size, n_actions)
 
-    def start(self, count):
-        """The recurrent states before the first decisions of count episodes: zeros, float32 [n, count, H]."""
-        return self.gru_hidden.new_zeros(len(self.gru_hidden), count, self.hidden_size)
+    def start(self, n_episodes):
+        """Hidden states before the first decision: zeros, float32 [n, B, H]."""
+        n_agents, hidden_size, _ = self.hidden_weight.shape
+        return self.hidden_weight.new_zeros(n_agents, n_episodes, hidden_size)
 
-    def forward(self, obs, previous, hidden, sizes):
-        """Utilities float32 [n, M, A], -inf for macro-actions an agent does not have, and recurrent states [n, M, H].
-        Sequences are packed step by step: sizes[t] entries of step t, the longest first, M in all. obs: float32
-        [n, M, d]. previous: int64 [n, M], the macro-action before, -1 for none. hidden: float32 [n, sizes[0], H]."""
-        one_hot = previous[..., None] == torch.arange(self.padding.shape[2], device=obs.device)  # [n, M, A]
-        gates = self.gru_input(torch.relu(self.encoder(torch.cat([self.obs_scale * obs, one_hot], 2))))  # [n, M, 3 H]
+    def forward(self, obs, previous, hidden):
+        """Utilities float32 [n, B, L, A] at the L decisions of each agent in each episode, and the last hidden states.
+
+        obs: float32 [n, B, L, d]. previous: int64 [n, B, L], the agent's macro-action before, -1 for none. hidden:
+        float32 [n, B, H].
+        """
+        one_hot = nn.functional.one_hot(previous + 1, self.n_actions + 1)[..., 1:]  # zeros for none
+        inputs = torch.cat([self.obs_scale * obs, one_hot], -1)
+        encoded = torch.relu(self.encoder(inputs))  # [n, B, L, H]
         states = []
-        for step in gates.split(sizes, 1):
-            hidden = hidden[:, : step.shape[1]]
-            in_reset, in_update, in_new = step.chunk(3, 2)  # [n, size, H] each
-            h_reset, h_update, h_new = torch.bmm(hidden, self.gru_hidden).chunk(3, 2)
-            reset, update = torch.sigmoid(in_reset + h_reset), torch.sigmoid(in_update + h_update)
-            hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
+        for from_input in self.input_layer(encoded).unbind(2):  # [n, B, 3 H], decision by decision
+            from_hidden = torch.bmm(hidden, self.hidden_weight)  # [n, B, 3 H]
+            reset_input, update_input, new_input = from_input.chunk(3, -1)
+            reset_hidden, update_hidden, new_hidden = from_hidden.chunk(3, -1)
+            reset = torch.sigmoid(reset_input + reset_hidden)
+            update = torch.sigmoid(update_input + update_hidden)
+            new = torch.tanh(new_input + reset * new_hidden)
+            hidden = torch.lerp(new, hidden, update)  # (1 - update) * new + update * hidden
             states.append(hidden)
-        states = torch.cat(states, 1)  # [n, M, H]
-        return self.output(torch.relu(self.head(states))).masked_fill(self.padding, -torch.inf), states
+        states = torch.stack(states, 2)  # [n, B, L, H]
+        return self.output(torch.relu(self.head(states))), hidden
 
 
-def over_rows(batch, *networks):
-    """Utilities float32 [B, T, n, A] of each network at the rows of a batch.
-    A macro-history moves where its agent chooses: networks run over own decisions, packed; rows look up the last."""
-    chosen = batch["chosen"].movedim(2, 0)  # [n, B, T]
-    step = chosen.cumsum(2) - chosen[..., :1].int()  # [n, B, T], a window begins with what its agents saw last
-    length = step[..., -1:]  # [n, B, 1]
-    rank = length.argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # [n, B, 1]
-    sizes = (length >= torch.arange(step.shape[2], device=step.device)).sum(1).amax(0)  # [T]
-    entry = (sizes.cumsum(0) - sizes)[step] + rank  # [n, B, T], where the latest decision is packed
-    agents = torch.arange(len(step), device=step.device)[:, None, None]
-    obs = batch["obs"].new_zeros(len(step), int(sizes.sum()), batch["obs"].shape[3])  # [n, M, d]
-    previous = batch["previous"].new_zeros(obs.shape[:2])  # [n, M]
-    obs[agents, entry] = batch["obs"].movedim(2, 0)  # rows with the same latest decision write the same
-    previous[agents, entry] = batch["previous"].movedim(2, 0)
-    sizes = sizes[sizes > 0].tolist()
-    return [net(obs, previous, net.start(sizes[0]), sizes)[0][agents, entry].movedim(0, 2) for net in networks]
+def utilities_at_rows(agents, batch):
+    """Q_i(h_i, .) of every agent at every row of a batch, float32 [B, T, n, A].
+
+    A macro-history grows only where its own agent chooses, so an agent's network runs over its own decisions alone.
+    At a row at which the agent is busy, its utilities are those of its latest decision.
+    """
+    free = batch["free"].movedim(2, 0)  # [n, B, T]
+    decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], for some agents with busy rows, which nobody reads
+    obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
+    previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
+    utilities, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
+    return utilities.take_along_dim(decision[..., None], 2).movedim(0, 2)  # and back to rows
 
 
 class ReplayBuffer:
-    """Whole episodes of rows (Fig. 2), one array [capacity + N, horizon + 1, ...] for each field of a row.
-    writing: the N episodes that run in the environments. queue: ended ones, the oldest first, after free places."""
+    """Episodes as rows (Fig. 2): those that run in the N environments, and the last `capacity` that have ended.
+
+    A row is a record of a NumPy structured array.
+    """
 
     def __init__(self, env, capacity):
-        n, d = env.single_observation_space.shape
-        fields = {
-            "obs": (n, d),  # what every agent last saw
-            "action": (n,),  # the macro-action that it runs
-            "since": (n,),  # and since which row: its macro-history moves where that is this one
-            "reward": (),  # sum of gamma^t r_t until the next row
-            "discount": (),  # gamma^tau (1 with --discount decision), 0 where the episode terminated
+        n_agents, obs_size = env.single_observation_space.shape
+        fields = [
+            ("obs", np.float32, (n_agents, obs_size)),  # what each agent last saw
+            ("available", bool, (n_agents, max(env.n_actions))),  # what it can do
+            ("action", np.int64, (n_agents,)),  # the macro-action that it runs from here on
+            ("since", np.int64, (n_agents,)),  # the row at which it chose that macro-action
+            ("reward", np.float32),  # the sum of gamma^t r_t over the tau steps until the next row
+            ("discount", np.float32),  # gamma^tau, or 0 if the episode terminates at the next row
+        ]
+        # An episode has at most a row for each step, and a last one for its final observation.
+        self.running = np.zeros((env.num_envs, env.horizon + 1), np.dtype(fields, align=True))
+        self.running_rows = np.zeros(env.num_envs, np.int64)  # rows that each running episode has so far
+        self.ended = deque(maxlen=capacity)  # arrays of rows, one for each episode, the oldest first
+
+    def begin_rows(self, obs, infos, actions, free):
+        """Begins a row in every environment in which an agent is free.
+
+        obs, infos: of the last reset or step. actions: int64 [N, n], what agents run from now on. free: bool [N, n].
+        """
+        e = np.flatnonzero(free.any(1))  # the environments that get a row
+        k = self.running_rows[e]  # and its number
+        since_before = self.running["since"][e, k - 1]  # not used at row 0, where all agents are free
+        rows = np.zeros(len(e), self.running.dtype)
+        rows["obs"] = obs[e]
+        rows["available"] = infos["available"][e]
+        rows["action"] = actions[e]
+        rows["since"] = np.where(free[e], k[:, None], since_before)
+        rows["discount"] = 1.0
+        self.running[e, k] = rows
+        self.running_rows[e] += 1
+
+    def add_step(self, rewards, discounts):
+        """Adds a time step to the latest row of every running episode.
+
+        rewards: float64 [N]. discounts: float64 [N], gamma, or 0 where the step terminated the episode.
+        """
+        latest = np.arange(len(rewards)), self.running_rows - 1
+        rows = self.running[latest]
+        rows["reward"] += rows["discount"] * rewards
+        rows["discount"] *= discounts
+        self.running[latest] = rows
+
+    def end_episodes(self, over, obs, infos):
+        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
+        self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
+        for e in np.flatnonzero(over):
+            self.ended.append(self.running[e, : self.running_rows[e]].copy())
+        self.running_rows[over] = 0
+
+    def sample(self, batch_size, rng):
+        """Random ended episodes, drawn with replacement: a list of arrays of rows."""
+        return [self.ended[number] for number in rng.integers(len(self.ended), size=batch_size)]
+
+    def state_dict(self):
+        """The rows that were written, for each episode as a tensor of bytes."""
+        running = [self.running[e, :length] for e, length in enumerate(self.running_rows)]
+        return {
+            "running": [torch.from_numpy(rows.view(np.uint8)) for rows in running],
+            "ended": [torch.from_numpy(rows.view(np.uint8)) for rows in self.ended],
         }
-        for name, shape in fields.items():
-            kind = int if name in ("action", "since") else np.float32
-            setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
-        self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
-        self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
 
-    def add(self, obs, actions, chosen):
-        """Notes a row wherever an agent chooses: float32 [N, n, d], int64 [N, n], bool [N, n]."""
-        env = np.flatnonzero(chosen.any(1))
-        at = episode, row = self.writing[env], self.rows[self.writing[env]]
-        since = np.where(chosen[env], row[:, None], self.since[episode, row - 1])
-        self.obs[at], self.action[at], self.since[at] = obs[env], actions[env], since
-        self.reward[at], self.discount[at] = 0.0, 1.0
-        self.rows[episode] += 1
-
-    def step(self, rewards, discounts, over, obs, infos):
-        """Adds a step to the running rows, r += gamma^t r_t, and ends the episodes in over, bool [N], with a row for
-        their final observation. rewards, discounts: float64 [N], the latter gamma, 0 at a terminal step."""
-        at = self.writing, self.rows[self.writing] - 1
-        self.reward[at] += self.discount[at] * rewards
-        self.discount[at] *= discounts
-        self.add(obs, infos["macro_action"], infos["macro_done"] & over[:, None])
-        self.writing[over], self.queue = np.split(np.append(self.queue, self.writing[over]), [over.sum()])
-        self.rows[self.writing[over]] = 0
-
-    def sample(self, batch_size, window, rng, device="cpu"):
-        """Random episodes, of longer ones a window: tensors [B, T, ...] by name, `valid` marks rows with a next one.
-        Windows reach over both ends and are cut there: every row of an episode is as likely as any other."""
-        episode = rng.choice(self.queue[self.rows[self.queue] > 0], (batch_size, 1))
-        last = self.rows[episode] - 1  # [B, 1], the row of the final observation
-        start = (last > window) * rng.integers(1 - window, last)  # 0 where the whole episode fits
-        end = np.minimum(start + window, last)
-        row = np.maximum(start, 0) + np.arange(min(window, last.max()) + 1)  # [B, T]
-        at = episode, np.minimum(row, end)
-        since = self.since[at]  # [B, T, n]
-        before = episode[..., None], since - 1, np.arange(since.shape[2])
-        batch = {key: getattr(self, key)[at] for key in ("obs", "action", "reward", "discount")}
-        previous = np.where(since > 0, self.action[before], -1)  # [B, T, n]
-        batch |= dict(valid=row < end, chosen=since == row[..., None], previous=previous)
-        return {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
+    def load_state_dict(self, saved):
+        """Goes on with what `state_dict` returned."""
+        for e, in_bytes in enumerate(saved["running"]):
+            rows = in_bytes.numpy().view(self.running.dtype)
+            self.running[e, : len(rows)] = rows
+            self.running_rows[e] = len(rows)
+        for in_bytes in saved["ended"]:
+            self.ended.append(in_bytes.numpy().view(self.running.dtype))
 
 
-def own_returns(batch, bootstrap, td_lambda=0.0):
-    """Each agent's own returns, float32 [B, T, n], and where they count, bool [B, T, n]: where a macro-action of
-    the agent starts that ends within the window. X[k], of the macro-action that runs at row k, from row k on, is
-    r[k] + gamma^tau X[k + 1] if it still runs at the next row, else r[k] + gamma^tau ((1 - lambda) Q'_i[k + 1] +
-    lambda X[k + 1]), with lambda = 0 where the next macro-action does not end within the window.
-    bootstrap: float32 [B, T, n], each agent's target value at the row. td_lambda: 0 for one macro-action's return."""
-    returns, own = torch.zeros_like(bootstrap), torch.zeros_like(batch["chosen"])
-    later, ends = returns[:, -1], own[:, -1]  # of the row after: [B, n]
+def make_batch(episodes, device="cpu"):
+    """Tensors [B, T, ...]: the fields of a row, and those below. Shorter episodes repeat their final row.
+
+    valid: bool [B, T], false at an episode's final row and its repeats. free: bool [B, T, n], agents that choose at the
+    row. previous: int64 [B, T, n], what an agent ran before its present macro-action, -1 for nothing.
+    """
+    length = np.array([len(episode) for episode in episodes])  # [B]
+    row = np.arange(length.max())  # [T]
+    rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
+    batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
+    since = batch["since"]  # [B, T, n]
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    batch["valid"] = row < length[:, None] - 1
+    batch["free"] = since == row[:, None]
+    batch["previous"] = np.where(since > 0, previous, -1)
+    return {name: torch.from_numpy(array).to(device) for name, array in batch.items()}
+
+
+def own_returns(bootstrap, batch, td_lambda):
+    """The agents' returns over their own macro-actions, float32 [B, T, n].
+
+    X[k] is an agent's return from row k on, at which it may be busy. If its macro-action still runs at the next row,
+    X[k] = r[k] + gamma^tau X[k + 1]. If it has ended, X[k] = r[k] + gamma^tau ((1 - lambda) Q'_i[k + 1] + lambda
+    X[k + 1]), with lambda = 0 if row k + 1 is the final one, at which all agents are free.
+
+    bootstrap: float32 [B, T, n], Q'_i of the greedy macro-action at each row.
+    """
+    returns = torch.zeros_like(bootstrap)
+    weight = td_lambda * batch["valid"][..., None]  # [B, T, 1], lambda, but 0 at the final row
     for k in reversed(range(returns.shape[1] - 1)):
-        chosen = batch["chosen"][:, k + 1]
-        mixed = torch.lerp(bootstrap[:, k + 1], later, td_lambda * ends)
-        later = batch["reward"][:, k, None] + batch["discount"][:, k, None] * torch.where(chosen, mixed, later)
-        ends = chosen | ends
-        returns[:, k], own[:, k] = later, ends & batch["chosen"][:, k]
-    return returns, own
+        next_return = returns[:, k + 1]  # [B, n]
+        at_choice = torch.lerp(bootstrap[:, k + 1], next_return, weight[:, k + 1])
+        later = torch.where(batch["free"][:, k + 1], at_choice, next_return)
+        returns[:, k] = batch["reward"][:, k, None] + batch["discount"][:, k, None] * later
+    return returns
 
 
-def own_loss(utilities, target_utilities, batch, td_lambda=0.0, hysteresis=1.0):
-    """The sum of the agents' losses, each a mean over its own transitions; values, returns and which count [B, T, n].
-    utilities, target_utilities: float32 [B, T, n, A]. td_lambda: 0 for one macro-action's return, up to 1.
-    hysteresis: factor on negative TD errors, 1 for none."""
-    q = utilities.gather(3, batch["action"][..., None])[..., 0]  # [B, T, n]
+def own_loss(utilities, target_utilities, batch, args, hysteresis=1.0):
+    """The sum of the agents' losses, and values and returns, float32 [number of transitions of all agents].
+
+    utilities, target_utilities: float32 [B, T, n, A], of the online and of the target networks.
+    """
+    q = utilities.gather(-1, batch["action"][..., None])[..., 0]  # [B, T, n]
+    own = batch["free"] & batch["valid"][..., None]  # [B, T, n], where an agent's transition begins
     with torch.no_grad():
-        bootstrap = target_utilities.gather(3, utilities.argmax(3)[..., None])[..., 0]  # [B, T, n], double Q-learning
-        returns, own = own_returns(batch, bootstrap, td_lambda)
+        choices = utilities.masked_fill(~batch["available"], -torch.inf)
+        best = choices.argmax(-1, keepdim=True)  # [B, T, n, 1]
+        bootstrap = target_utilities.gather(-1, best)[..., 0]  # [B, T, n], double Q
+        returns = own_returns(bootstrap, batch, args.td_lambda)
     error = torch.where(own, returns - q, 0.0)
     error = torch.where(error < 0, hysteresis * error, error)
-    return (error.square().sum((0, 1)) / own.sum((0, 1)).clamp(min=1)).sum(), q, returns, own
+    mean_of_agent = error.square().sum((0, 1)) / own.sum((0, 1))  # [n]
+    return mean_of_agent.sum(), q[own], returns[own]
 
 
 def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
-    """Epsilon-greedy macro-actions int64 [N, n] and recurrent states float32 [n, N, H], moved where agents are free.
-    obs, float32 [N, n, d], and infos are those of the environment's last reset or step."""
-    free, running = infos["macro_done"], infos["macro_action"]
-    by_agent = [torch.from_numpy(x).to(hidden.device).transpose(0, 1) for x in (obs, running, free)]  # [n, N, ...]
+    """Epsilon-greedy macro-actions int64 [N, n] and new hidden states. A busy agent can only go on.
+
+    obs: float32 [N, n, d]. infos: those of the last reset or step. hidden: float32 [n, N, H]; only those of free
+    agents change.
+    """
+    free = infos["macro_done"]
+    available = infos["available"]
+    own_obs = torch.from_numpy(obs).to(hidden.device).transpose(0, 1)[:, :, None]  # [n, N, 1, d]
+    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)  # used where free
     with torch.no_grad():
-        utilities, states = agents(*by_agent[:2], hidden, [len(obs)])
-    actions = utilities.argmax(2).T.cpu().numpy()  # [N, n]
+        utilities, new_hidden = agents(own_obs, previous, hidden)
+    is_free = torch.from_numpy(free.T[..., None]).to(hidden.device)  # [n, N, 1]
+    hidden = torch.where(is_free, new_hidden, hidden)
+    utilities = utilities[:, :, 0].transpose(0, 1).cpu().numpy()  # [N, n, A]
+    actions = np.where(available, utilities, -np.inf).argmax(2)
     if epsilon > 0:
-        actions = np.where(rng.random(free.shape) < epsilon, rng.integers(agents.n_actions, size=free.shape), actions)
-    return np.where(free, actions, running), torch.where(by_agent[2][..., None], states, hidden)
+        random_actions = np.where(available, rng.random(available.shape), -1.0).argmax(2)  # uniform
+        explores = rng.random(free.shape) < epsilon
+        actions = np.where(explores, random_actions, actions)
+    return actions, hidden
 
 
 def evaluate(agents, env, gamma, seed):
-    """Greedy play: return, discounted_return, length, success of each environment's first episode, float64 [N] each."""
+    """Greedy play of one episode in each environment: return, discounted_return, length, success, float64 [N] each."""
     obs, infos = env.reset(seed=seed)
-    hidden, live, step, result = agents.start(env.num_envs), np.ones(env.num_envs, bool), 0, {}
-    while live.any():
+    hidden = agents.start(env.num_envs)
+    running = np.ones(env.num_envs, bool)
+    names = ("return", "discounted_return", "length", "success")
+    result = {name: np.zeros(env.num_envs) for name in names}
+    step = 0
+    while running.any():
         actions, hidden = act(agents, obs, infos, hidden)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        new = {"return": rewards, "discounted_return": gamma**step * rewards, "length": 1, "success": infos["success"]}
-        result = {key: result.get(key, 0.0) + live * value for key, value in new.items()}
+        result["return"] += running * rewards
+        result["discounted_return"] += running * gamma**step * rewards
+        result["length"] += running
+        result["success"] += running & infos["success"]  # true in one step of an episode at most
         over = terminations | truncations
-        live &= ~over
+        running &= ~over
         step += 1
-        obs, infos = env.reset(options={"reset_mask": over})  # play on in ended environments without looking
+        obs, infos = env.reset(options={"reset_mask": over})  # the next ones do not count
         hidden[:, over] = 0.0
     return result
 
 
 def make_learner(args, env):
-    """Agents as a module on the device."""
-    agents = Agents(env.n_actions, env.single_observation_space.shape[1], args.hidden_size, args.obs_scale)
+    """The agents' networks, in a module on the device."""
+    obs_size = env.single_observation_space.shape[1]
+    agents = Agents(env.n_agents, max(env.n_actions), obs_size, args.hidden_size, args.obs_scale)
     return nn.ModuleDict({"agents": agents}).to(args.device)
 
 
-def train(args, stop=()):
-    """Trains from Args, or goes on with the run args.resume, until something is in stop; returns the run folder."""
+def train(args):
+    """Trains, or goes on with the run in args.resume, and returns the run's folder."""
     torch.set_num_threads(1)  # fastest for networks of this size
-    torch.manual_seed(args.seed)
-    rng = np.random.default_rng(args.seed)
-    env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda: there is none")
+    seeds = np.random.SeedSequence(args.seed).generate_state(5, np.uint64).tolist()
+    network_seed, explore_seed, replay_seed, env_seed, eval_seed = seeds  # no two purposes share random numbers
+    torch.manual_seed(network_seed)
+    explore_rng = np.random.default_rng(explore_seed)
+    replay_rng = np.random.default_rng(replay_seed)
+    env = envs.make(args.env, args.num_envs)
+    eval_env = envs.make(args.env, args.eval_episodes)
     learner = make_learner(args, env)
-    target, agents = copy.deepcopy(learner).requires_grad_(False), learner["agents"]
-    fast, slow = list(learner.parameters()), list(target.parameters())
-    optimizer = torch.optim.Adam(fast, lr=args.learning_rate, fused=True)
+    target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, without gradients
+    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
     buffer = ReplayBuffer(env, args.buffer_size)
-    step_gamma, row_gamma = (args.gamma, 1.0) if args.discount == "step" else (1.0, args.gamma)
-    obs, infos = env.reset(seed=args.seed)
-    hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
-    folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
+    parts = {
+        "learner": learner,
+        "target": target,
+        "optimizer": optimizer,
+        "buffer": buffer,
+    }
+    obs, infos = env.reset(seed=env_seed)
+    hidden = learner["agents"].start(args.num_envs)
+    step = 0
+    updates = 0
+    best_return = -np.inf
+    run_name = f"{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}".replace(":", "-")
+    folder = Path(args.resume or f"{args.runs_dir}/{run_name}")
+    if args.resume:
+        saved = load(folder / "checkpoint.pt")
+        for name, part in parts.items():
+            part.load_state_dict(saved[name])
+        obs, infos = env.load_state(saved["env"])
+        hidden = saved["hidden"].to(args.device)
+        explore_rng.bit_generator.state, replay_rng.bit_generator.state = saved["rngs"]
+        step, updates, best_return = saved["progress"]
+    else:
+        folder.mkdir(parents=True)
+        (folder / "args.json").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
     if args.track:
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    if args.resume:
-        saved = load(folder / "checkpoint.pt")
-        for part, state in zip((learner, target, optimizer), saved["parts"], strict=True):
-            part.load_state_dict(state)
-        vars(buffer).update({key: value.numpy() for key, value in saved["buffer"].items()})
-        obs, infos = env.load_state(saved["env"])
-        rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
-        step, updates, recent, best = saved["counts"]
-    else:
-        folder.mkdir(parents=True)
-        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
-        (folder / "args.json.new").replace(folder / "args.json")
-    writer = SummaryWriter(folder, purge_step=step + 1)
-    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
-    time0, step0, saved_at = time.time(), step, time.time()
-
-    def log(group, **values):
-        for key, value in values.items():
-            writer.add_scalar(f"{group}/{key}", value, step)
+    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    print(folder)
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
+    saved_at = -np.inf  # so there is a checkpoint from the first step on
 
     while step < args.total_timesteps:
-        # Choose and step
-        epsilon = np.interp(step - args.learning_starts, [0, args.exploration_timesteps], [1.0, args.end_e])
-        done = step / args.total_timesteps
-        optimizer.param_groups[0]["lr"] = args.learning_rate * (1 + done * (args.learning_rate_end - 1))
-        actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
-        buffer.add(obs, actions, infos["macro_done"])
+        # ---- act: one time step in every environment ----
+        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
+        actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
+        buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over = terminations | truncations
-        buffer.step(args.reward_scale * rewards, step_gamma * ~terminations, over, obs, infos)
+        buffer.add_step(args.reward_scale * rewards, np.where(terminations, 0.0, args.gamma))
         step += args.num_envs
         bar.update(args.num_envs)
+        over = terminations | truncations
         if over.any():
-            recent += env.episode_return[over].tolist()
+            buffer.end_episodes(over, obs, infos)
+            writer.add_scalar("charts/episodic_return", env.episode_return[over].mean(), step)
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
 
-        # Learn
-        while updates < (step - args.learning_starts) // args.train_frequency and buffer.rows[buffer.queue].any():
-            batch = buffer.sample(args.batch_size, args.window, rng, args.device)
-            batch["discount"] *= row_gamma
-            utilities = over_rows(batch, agents, target["agents"])
-            beta = np.interp((step - args.learning_starts) / args.exploration_timesteps, [1, 2], [args.hysteresis, 1.0])
-            loss, q, _, _ = own_loss(*utilities, batch, args.td_lambda, beta)
+        # ---- learn: an update for each multiple of train_frequency that was just passed ----
+        due = step // args.train_frequency - (step - args.num_envs) // args.train_frequency
+        can_learn = step > args.learning_starts and buffer.ended
+        for _ in range(due if can_learn else 0):
+            if args.anneal_lr:
+                optimizer.param_groups[0]["lr"] = args.learning_rate * max(0.0, 1 - step / args.total_timesteps)
+            hysteresis = np.interp(phase, [1, 2], [args.hysteresis, 1.0])
+            batch = make_batch(buffer.sample(args.batch_size, replay_rng), args.device)
+            utilities = utilities_at_rows(learner["agents"], batch)
+            target_utilities = utilities_at_rows(target["agents"], batch)
+            loss, q, _ = own_loss(utilities, target_utilities, batch, args, hysteresis)
             optimizer.zero_grad()
             loss.backward()
-            grad_norm = nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
+            grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
             optimizer.step()
-            torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)(slow, fast, None)
+            for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
+                slow.lerp_(fast.detach(), 1 - args.polyak)
             updates += 1
             if updates % 100 == 0:
-                log("losses", td_loss=loss, q_values=q[batch["valid"]].mean(), grad_norm=grad_norm)
+                writer.add_scalar("losses/td_loss", loss, step)
+                writer.add_scalar("losses/q_values", q.mean(), step)
+                writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # Log, evaluate, save
-        if step % 2_000 < args.num_envs and recent:
-            log("charts", SPS=(step - step0) / (time.time() - time0), epsilon=epsilon, episodic_return=np.mean(recent))
-            recent = []
+        # ---- evaluate, log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
-            seed = args.seed * 10**9 + step  # fresh episodes
-            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, seed).items()}
-            log("eval", **result)
+            episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
+            result = {name: values.mean().item() for name, values in episodes.items()}
+            for name, value in result.items():
+                writer.add_scalar(f"eval/{name}", value, step)
+            writer.add_scalar("charts/epsilon", epsilon, step)
+            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
             model = dict(step=step, networks=learner.state_dict(), **result)
             save(folder / "last.pt", args, **model)
-            if result["return"] >= best:
-                best = result["return"]
+            if result["return"] >= best_return:
+                best_return = result["return"]
                 save(folder / "best.pt", args, **model)
-            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
-        if time.time() - saved_at > args.checkpoint_frequency or stop:
-            writer.flush()  # what was logged up to here is not logged again after a resume
-            arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
-            parts = [part.state_dict() for part in (learner, target, optimizer)]
-            memory = {key: torch.from_numpy(value) for key, value in vars(buffer).items()}
-            save(folder / "checkpoint.pt", args, parts=parts, buffer=memory, env=arrays, hidden=hidden,
-                 rng=rng.bit_generator.state, counts=(step, updates, recent, best))  # fmt: skip
-            saved_at = time.time()
-            if stop:
-                break
+        if time.monotonic() - saved_at > args.checkpoint_frequency:
+            writer.flush()  # what was logged up to here outlives a kill
+            save(
+                folder / "checkpoint.pt",
+                args,
+                **{name: part.state_dict() for name, part in parts.items()},
+                env={name: torch.from_numpy(array) for name, array in env.save_state().items()},
+                hidden=hidden,
+                rngs=(explore_rng.bit_generator.state, replay_rng.bit_generator.state),
+                progress=(step, updates, best_return),
+            )
+            saved_at = time.monotonic()
 
     bar.close()
     writer.close()
-    if step >= args.total_timesteps:
-        (folder / "checkpoint.pt").unlink(missing_ok=True)
+    (folder / "checkpoint.pt").unlink(missing_ok=True)
     return folder
 
 
 def save(path, args, **content):
-    """Writes beside the file and swaps, so that a kill at any moment leaves the old one or the new one."""
+    """Writes beside the file and swaps, so that a kill at any moment leaves the old file or the new one."""
     torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, f"{path}.new")
     Path(f"{path}.new").replace(path)
 
@@ -403,38 +515,37 @@ def load(path):
         saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
         if saved["algorithm"] != ALGORITHM:
             raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
-        Args(**saved["args"])  # fails where a setting is not one of this version
+        Args(**saved["args"])  # raises TypeError if a setting is of another version
         return saved
-    except Exception as error:  # torch names no common class for what a damaged file raises
+    except Exception as error:  # a damaged file raises errors of many classes
         raise SystemExit(f"cannot read {path}: {error}".splitlines()[0]) from None
 
 
 def parse_args(argv=None):
-    """Args from the command line, over the defaults of the task or the settings of the run to go on with."""
+    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
     known, others = peek.parse_known_args(argv)
-    if known.resume and (known.env or others):
-        raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
     if known.resume:
-        return Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
+        if known.env or others:
+            raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
+        saved = load(Path(known.resume) / "checkpoint.pt")
+        return Args(**{**saved["args"], "resume": known.resume})
     env = known.env or Args.env
-    defaults = next((row for start, row in DEFAULTS.items() if env.startswith(start)), {})
-    args = tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
-    if args.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("--device cuda: there is none")
-    return args
+    defaults = {}
+    for beginning, values in DEFAULTS.items():
+        if env.startswith(beginning):
+            defaults = values
+    return tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
 
 
 if __name__ == "__main__":
-    stop = []  # Ctrl-C or a termination signal: end between two steps, where a checkpoint is whole
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: stop.append(number))
+    args = parse_args()
     try:
-        print(folder := train(parse_args(), stop))
+        train(args)
     except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
         raise SystemExit(error) from None
-    if (folder / "checkpoint.pt").exists():
-        print(f"stopped; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
-        sys.exit(128 + stop[0])
+    except KeyboardInterrupt:
+        print("stopped; --resume with the run's folder goes on from its last checkpoint", file=sys.stderr)
+        sys.exit(130)

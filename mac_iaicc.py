@@ -1,31 +1,40 @@
 """Mac-IAICC: independent macro-action actors, each with a centralised critic of its own.
 
-The actor-critic baseline of Xiao et al. (2022, "Asynchronous actor-critic for multi-agent reinforcement learning"), on
-policy. Actors see their own macro-histories and are all that is needed to act; critics see the joint one and are needed
-for learning only.
+This is the actor-critic baseline of Xiao et al. (2022, "Asynchronous actor-critic for multi-agent reinforcement
+learning"). It learns on policy. Actors see their own macro-histories and are all that is needed to act. Critics see the
+joint macro-history and are needed for learning only. Four ideas carry the whole file:
 
-    critic of agent i     V_i(joint macro-history): a recurrent network that moves at every row
-    boundaries of i       the rows where agent i chooses: its critic is trained and its policy improved only there
-    n-step return         G_i = r_i + gamma^tau_i r'_i + ... + gamma^(tau_i + tau'_i + ...) V'_i, over n of its own
-                          macro-actions, r_i being the joint reward summed over each
-    actor                 gradient of log pi_i(m_i | h_i) (G_i - V_i), pi_i epsilon-soft: a softmax, mixed with uniform
+    row        A time step at which at least one agent is free and starts a macro-action. Only rows are stored.
+    available  What an agent can do at a row. A free agent chooses among the macro-actions that it can start. A busy
+               agent can only go on.
+    return     G_i = r_1 + gamma^tau_1 r_2 + ... + gamma^(tau_1 + ... + tau_l) V'_i over the next l = n_step
+               macro-actions of agent i. r_j is the discounted reward of the tau_j steps of the j-th, V'_i is the target
+               critic. Returns begin where agent i chooses, and only there its critic V_i and its policy learn.
+    actor      It follows the gradient of log pi_i(m_i | h_i) (G_i - V_i). The policy pi_i is epsilon-soft: a softmax
+               over what is available, mixed with the uniform policy over it.
 
-Parallel environments collect whole episodes; as soon as `batch_size` of them have ended, one gradient step is taken on
-all that have, and they are forgotten.
+Parallel environments play whole episodes. When batch_size or more of them have ended, one gradient step is taken on all
+of these, and they are deleted.
+
+Shapes: N environments, B episodes, T rows, L decisions of an agent, n agents, A macro-actions of the agent that has
+most (for the others the rest is never available), d numbers of a macro-observation, H hidden units.
 
 Numbered deviations from the published baseline:
- 1. An episode that was running when a step was taken was begun by the policy before it.
- 2. An episode truncated by the horizon bootstraps from its final observation, a terminated one does not.
- 3. Target critics follow slowly (Polyak) at every update instead of being copied now and then.
- 4. One Adam step is taken for actors and critics together, their losses being sums over agents of means over decisions.
- 5. Evaluation is greedy: the most likely macro-action.
- 6. Values are ours, as are scaled inputs and rewards and a falling step size (docs/defaults.md).
+ 1. Episodes go on while gradient steps are taken, so an older policy may have played the beginning of one.
+ 2. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
+ 3. Target critics follow by Polyak averaging. The published ones are copied now and then.
+ 4. One Adam step is taken for actors and critics together. Losses are summed over agents, each a mean over decisions.
+ 5. The published actor loss is weighted by gamma^t, which this one is not.
+ 6. Actors see their previous macro-action, too. Critics also see who is free and each agent's latest macro-action.
+    Networks have a GRU, where the published ones have an LSTM.
+ 7. Evaluation is greedy: the most likely macro-action.
+ 8. On Box Pushing agents play at random first, and negative errors of the critics count less while agents explore
+    (--random-timesteps, --hysteresis), as in the Q-learning scripts. docs/defaults.md explains all values.
 """
 
 import argparse
 import copy
 import json
-import signal
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -42,61 +51,80 @@ from tqdm import tqdm
 import envs
 
 ALGORITHM = Path(__file__).stem
+AT_MOST_1 = ("learning_rate", "gamma", "polyak", "start_e", "end_e", "hysteresis")
 
 
 @dataclass
 class Args:
-    env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see envs.register
-    seed: int = 1  # seed of networks, exploration, replay and environments, from 0 on
-    total_timesteps: int = 400_000  # environment steps of the run, over all environments
+    env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
+    seed: int = 1  # of networks, exploration and environments, from 0 on
+    total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 4  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
     checkpoint_frequency: float = 60.0  # seconds between checkpoints, from which --resume continues exactly
     runs_dir: str = "runs"  # folder in which each run makes its own
-    resume: str | None = None  # run folder of an interrupted run to go on with, with its own settings
+    resume: str | None = None  # folder of an interrupted run to go on with, with its own settings
     device: Literal["cpu", "cuda"] = "cpu"  # where networks learn and act
-    track: bool = False  # log to Weights & Biases too, which takes project and entity from its environment variables
+    track: bool = False  # log to Weights & Biases too
 
     # Algorithm
     learning_rate: float = 1e-3  # Adam's step size
-    learning_rate_end: float = 0.0  # share of the step size left at total_timesteps, reached linearly
-    gamma: float = 0.98  # discount factor, in [0, 1]
-    discount: Literal["step", "decision"] = "step"  # gamma for each step of a row, or once a row however long it is
-    batch_size: int = 4  # episodes that end before an update is made on them
-    n_step: int = 5  # macro-actions of an agent in its return before its target critic takes over
+    anneal_lr: bool = True  # let it fall linearly to 0 at total_timesteps
+    gamma: float = 0.98  # discount factor of an environment step, in [0, 1]
+    batch_size: int = 4  # an update is made on the ended episodes when there are at least so many
+    n_step: int = 5  # macro-actions over which a return sums rewards before it bootstraps
     polyak: float = 0.95  # share of the target critics kept at each update; higher is slower
-    start_e: float = 0.5  # share of uniform macro-actions in the policies at the start
-    exploration_timesteps: int = 200_000  # environment steps over which the share falls linearly
-    end_e: float = 0.01  # that share from exploration_timesteps on
+    random_timesteps: int = 0  # environment steps at first with epsilon 1, from which only the critics learn
+    start_e: float = 0.5  # share epsilon of the uniform policy once random_timesteps are over
+    exploration_timesteps: int = 200_000  # environment steps after random_timesteps over which epsilon falls
+    end_e: float = 0.01  # final epsilon
     entropy_coef: float = 0.01  # weight of the policies' entropy in the loss; bigger explores longer
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations inside the networks; more resolves small differences
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.01  # factor on rewards inside the loss; logged returns are unscaled
+    hysteresis: float = (
+        1.0  # factor on critics' negative errors; when epsilon has fallen it rises to 1 in as many steps
+    )
     hidden_size: int = 64  # width of the actors' and critics' layers
 
     def __post_init__(self):
-        if problem := envs.problem(self.env):
+        problem = envs.problem(self.env)
+        if problem:
             raise SystemExit(f"--env: {problem}")
-        shares = "learning_rate learning_rate_end gamma polyak start_e end_e"
         for name, value in vars(self).items():
-            low = type(value) is int and name != "seed"
-            high = 1 if name in shares.split() else float("inf")
-            if type(value) in (int, float) and not low <= value <= high:  # tyro has checked the others' types
-                raise SystemExit(f"--{name.replace('_', '-')} must be from {int(low)} to {high}, got {value}")
+            low = 1 if type(value) is int and name not in ("seed", "random_timesteps") else 0
+            high = 1 if name in AT_MOST_1 else 10**15
+            if type(value) in (int, float) and not low <= value <= high:
+                raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
-# Where tasks whose ids start so need other values; docs/defaults.md says how they were chosen.
+# Other values for the tasks whose ids begin with the key. docs/defaults.md says how they were chosen.
 DEFAULTS = {
-    "bp": dict(total_timesteps=600_000, exploration_timesteps=300_000),
-    "wtd-t": dict(total_timesteps=800_000),
-    "ct": dict(total_timesteps=600_000, exploration_timesteps=150_000, learning_rate=5e-4, gamma=0.9, num_envs=32,
-               batch_size=32, obs_scale=4.0, reward_scale=1.0, eval_episodes=400),
-}  # fmt: skip
+    "bp-": dict(
+        total_timesteps=600_000,
+        random_timesteps=150_000,
+        exploration_timesteps=200_000,
+        hysteresis=0.1,
+    ),
+    "wtd-d": dict(total_timesteps=300_000),
+    "wtd-t": dict(total_timesteps=600_000),
+    "ct-": dict(
+        total_timesteps=600_000,
+        exploration_timesteps=150_000,
+        num_envs=32,
+        eval_episodes=400,
+        learning_rate=5e-4,
+        gamma=0.9,
+        batch_size=32,
+        obs_scale=4.0,
+        reward_scale=1.0,
+    ),
+}
 
 
 class AgentLinear(nn.Module):
-    """A linear layer for each agent, as one batched product: [n, M, inputs] -> [n, M, outputs]."""
+    """One linear layer for each agent, as a batched product: [n, ..., inputs] -> [n, ..., outputs]."""
 
     def __init__(self, n_agents, inputs, outputs):
         super().__init__()
@@ -105,318 +133,414 @@ class AgentLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(n_agents, 1, outputs).uniform_(-bound, bound))
 
     def forward(self, x):
-        return torch.baddbmm(self.bias, x, self.weight)
+        flat = x.flatten(1, -2)  # [n, all in between, inputs]
+        return torch.baddbmm(self.bias, flat, self.weight).unflatten(1, x.shape[1:-1])
 
 
 class Agents(nn.Module):
-    """A network for each agent, H = hidden_size wide: Linear, ReLU, GRU, Linear, ReLU, Linear, logits or one value."""
+    """A network for each agent, an actor or a critic: Linear, ReLU, GRU, Linear, ReLU, Linear.
 
-    def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
+    Agents share no weights, but their networks have one shape. So they run side by side, as batched products, and the
+    GRU is written out. With an nn.GRU for each agent an update would take up to twice as long.
+    """
+
+    def __init__(self, n_agents, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
-        n, widest, bound = len(n_actions), max(n_actions), hidden_size**-0.5
-        self.n_actions, self.hidden_size, self.obs_scale = np.array(n_actions), hidden_size, obs_scale
-        self.encoder = AgentLinear(n, obs_size + widest, hidden_size)
-        self.gru_input = AgentLinear(n, hidden_size, 3 * hidden_size)
-        self.gru_hidden = nn.Parameter(torch.empty(n, hidden_size, 3 * hidden_size).uniform_(-bound, bound))
-        self.head = AgentLinear(n, hidden_size, hidden_size)
-        self.output = AgentLinear(n, hidden_size, widest)
-        padding = torch.arange(widest) >= torch.tensor(n_actions)[:, None, None]  # [n, 1, A]
-        self.register_buffer("padding", padding, persistent=False)
+        self.n_actions = n_actions
+        self.obs_scale = obs_scale
+        self.encoder = AgentLinear(n_agents, obs_size + n_actions, hidden_size)
+        self.input_layer = AgentLinear(n_agents, hidden_size, 3 * hidden_size)
+        bound = hidden_size**-0.5
+        hidden_weight = torch.empty(n_agents, hidden_size, 3 * hidden_size)  # without a bias of its own
+        self.hidden_weight = nn.Parameter(hidden_weight.uniform_(-bound, bound))
+        self.head = AgentLinear(n_agents, hidden_size, hidden_size)
+        self.output = AgentLinear(n_agents, hidden_size, n_actions)
 
-    def start(self, count):
-        """The recurrent states before the first decisions of count episodes: zeros, float32 [n, count, H]."""
-        return self.gru_hidden.new_zeros(len(self.gru_hidden), count, self.hidden_size)
+    def start(self, n_episodes):
+        """Hidden states before the first decision: zeros, float32 [n, B, H]."""
+        n_agents, hidden_size, _ = self.hidden_weight.shape
+        return self.hidden_weight.new_zeros(n_agents, n_episodes, hidden_size)
 
-    def forward(self, obs, previous, hidden, sizes):
-        """Logits float32 [n, M, A], -inf for macro-actions an agent does not have, and recurrent states [n, M, H].
-        Sequences are packed step by step: sizes[t] entries of step t, the longest first, M in all. obs: float32
-        [n, M, d]. previous: int64 [n, M], the macro-action before, -1 for none. hidden: float32 [n, sizes[0], H]."""
-        one_hot = previous[..., None] == torch.arange(self.padding.shape[2], device=obs.device)  # [n, M, A]
-        gates = self.gru_input(torch.relu(self.encoder(torch.cat([self.obs_scale * obs, one_hot], 2))))  # [n, M, 3 H]
+    def forward(self, obs, previous, hidden):
+        """Outputs float32 [n, B, L, A] at the L decisions of each agent in each episode, and the last hidden states.
+
+        obs: float32 [n, B, L, d]. previous: int64 [n, B, L], the agent's macro-action before, -1 for none. hidden:
+        float32 [n, B, H].
+        """
+        one_hot = nn.functional.one_hot(previous + 1, self.n_actions + 1)[..., 1:]  # zeros for none
+        inputs = torch.cat([self.obs_scale * obs, one_hot], -1)
+        encoded = torch.relu(self.encoder(inputs))  # [n, B, L, H]
         states = []
-        for step in gates.split(sizes, 1):
-            hidden = hidden[:, : step.shape[1]]
-            in_reset, in_update, in_new = step.chunk(3, 2)  # [n, size, H] each
-            h_reset, h_update, h_new = torch.bmm(hidden, self.gru_hidden).chunk(3, 2)
-            reset, update = torch.sigmoid(in_reset + h_reset), torch.sigmoid(in_update + h_update)
-            hidden = torch.lerp(torch.tanh(torch.addcmul(in_new, reset, h_new)), hidden, update)
+        for from_input in self.input_layer(encoded).unbind(2):  # [n, B, 3 H], decision by decision
+            from_hidden = torch.bmm(hidden, self.hidden_weight)  # [n, B, 3 H]
+            reset_input, update_input, new_input = from_input.chunk(3, -1)
+            reset_hidden, update_hidden, new_hidden = from_hidden.chunk(3, -1)
+            reset = torch.sigmoid(reset_input + reset_hidden)
+            update = torch.sigmoid(update_input + update_hidden)
+            new = torch.tanh(new_input + reset * new_hidden)
+            hidden = torch.lerp(new, hidden, update)  # (1 - update) * new + update * hidden
             states.append(hidden)
-        states = torch.cat(states, 1)  # [n, M, H]
-        return self.output(torch.relu(self.head(states))).masked_fill(self.padding, -torch.inf), states
+        states = torch.stack(states, 2)  # [n, B, L, H]
+        return self.output(torch.relu(self.head(states))), hidden
 
 
-def over_rows(batch, *networks):
-    """Logits or values float32 [B, T, n, A] of each network at the rows of a batch.
-    A macro-history moves where its agent chooses: networks run over own decisions, packed; rows look up the last."""
-    chosen = batch["chosen"].movedim(2, 0)  # [n, B, T]
-    step = chosen.cumsum(2) - chosen[..., :1].int()  # [n, B, T], a window begins with what its agents saw last
-    length = step[..., -1:]  # [n, B, 1]
-    rank = length.argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # [n, B, 1]
-    sizes = (length >= torch.arange(step.shape[2], device=step.device)).sum(1).amax(0)  # [T]
-    entry = (sizes.cumsum(0) - sizes)[step] + rank  # [n, B, T], where the latest decision is packed
-    agents = torch.arange(len(step), device=step.device)[:, None, None]
-    obs = batch["obs"].new_zeros(len(step), int(sizes.sum()), batch["obs"].shape[3])  # [n, M, d]
-    previous = batch["previous"].new_zeros(obs.shape[:2])  # [n, M]
-    obs[agents, entry] = batch["obs"].movedim(2, 0)  # rows with the same latest decision write the same
-    previous[agents, entry] = batch["previous"].movedim(2, 0)
-    sizes = sizes[sizes > 0].tolist()
-    return [net(obs, previous, net.start(sizes[0]), sizes)[0][agents, entry].movedim(0, 2) for net in networks]
+def logits_at_rows(agents, batch):
+    """Logits of every agent's policy at every row of a batch, float32 [B, T, n, A].
+
+    A macro-history grows only where its own agent chooses, so an agent's network runs over its own decisions alone.
+    At a row at which the agent is busy, its logits are those of its latest decision.
+    """
+    free = batch["free"].movedim(2, 0)  # [n, B, T]
+    decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], for some agents with busy rows, which nobody reads
+    obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
+    previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
+    logits, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
+    return logits.take_along_dim(decision[..., None], 2).movedim(0, 2)  # and back to rows
 
 
-def joint_batch(batch, width):
-    """The batch of the critics, which move at every row: each sees what all agents saw last, who is free and the
-    macro-actions before, one-hot and this wide."""
-    inside = (batch["valid"] | batch["valid"].roll(1, 1))[..., None]  # [B, T, 1], rows of the episode
-    free = batch["chosen"] | ~inside  # [B, T, n], beyond its end as at its end
-    before = torch.where(free, batch["previous"], batch["action"])  # [B, T, n]
-    before = before[..., None] == torch.arange(width, device=before.device)  # [B, T, n, A]
-    obs = torch.cat([batch["obs"], free[..., None], before], 3)  # [B, T, n, d + 1 + A]
-    obs = obs.flatten(2)[:, :, None].expand(-1, -1, free.shape[2], -1)  # [B, T, n, n * (d + 1 + A)]
-    return dict(obs=obs, previous=torch.full_like(batch["previous"], -1), chosen=inside.expand_as(free))
+class Critics(nn.Module):
+    """The agents' critics V_i of the joint macro-history, which grows at every row."""
+
+    def __init__(self, n_agents, n_actions, obs_size, hidden_size, obs_scale=1.0):
+        super().__init__()
+        self.n_actions = n_actions
+        self.obs_scale = obs_scale
+        joint_size = n_agents * (obs_size + 1 + n_actions)
+        self.networks = Agents(n_agents, 1, joint_size, hidden_size)  # one output: the value
+
+    def forward(self, batch):
+        """Values float32 [B, T, n] at every row. A critic sees what all agents saw and did last, and who is free."""
+        free = batch["free"]
+        latest = torch.where(free, batch["previous"], batch["action"])  # [B, T, n], the macro-actions up to the row
+        one_hot = nn.functional.one_hot(latest + 1, self.n_actions + 1)[..., 1:]  # zeros for none
+        joint = torch.cat([self.obs_scale * batch["obs"], free[..., None], one_hot], -1).flatten(2)
+        joint = joint.expand(free.shape[2], *joint.shape)  # [n, B, T, n * (d + 1 + A)], the same for all
+        none = joint.new_full(joint.shape[:3], -1, dtype=torch.int64)  # joint has the macro-actions already
+        values, _ = self.networks(joint, none, self.networks.start(len(free)))
+        return values[..., 0].movedim(0, 2)
 
 
 class EpisodeBuffer:
-    """Whole episodes of rows (Fig. 2), one array [capacity + N, horizon + 1, ...] for each field of a row.
-    writing: the N episodes that run in the environments. queue: ended ones, the oldest first, after free places."""
+    """Episodes as rows (Fig. 2): those that run in the N environments, and those that have ended since the last update.
 
-    def __init__(self, env, capacity):
-        n, d = env.single_observation_space.shape
-        fields = {
-            "obs": (n, d),  # what every agent last saw
-            "action": (n,),  # the macro-action that it runs
-            "since": (n,),  # and since which row: its macro-history moves where that is this one
-            "reward": (),  # sum of gamma^t r_t until the next row
-            "discount": (),  # gamma^tau, 0 where the episode terminated
+    A row is a record of a NumPy structured array.
+    """
+
+    def __init__(self, env):
+        n_agents, obs_size = env.single_observation_space.shape
+        fields = [
+            ("obs", np.float32, (n_agents, obs_size)),  # what each agent last saw
+            ("available", bool, (n_agents, max(env.n_actions))),  # what it can do
+            ("action", np.int64, (n_agents,)),  # the macro-action that it runs from here on
+            ("since", np.int64, (n_agents,)),  # the row at which it chose that macro-action
+            ("reward", np.float32),  # the sum of gamma^t r_t over the tau steps until the next row
+            ("discount", np.float32),  # gamma^tau, or 0 if the episode terminates at the next row
+        ]
+        # An episode has at most a row for each step, and a last one for its final observation.
+        self.running = np.zeros((env.num_envs, env.horizon + 1), np.dtype(fields, align=True))
+        self.running_rows = np.zeros(env.num_envs, np.int64)  # rows that each running episode has so far
+        self.ended = []  # arrays of rows, one for each episode
+
+    def begin_rows(self, obs, infos, actions, free):
+        """Begins a row in every environment in which an agent is free.
+
+        obs, infos: of the last reset or step. actions: int64 [N, n], what agents run from now on. free: bool [N, n].
+        """
+        e = np.flatnonzero(free.any(1))  # the environments that get a row
+        k = self.running_rows[e]  # and its number
+        since_before = self.running["since"][e, k - 1]  # not used at row 0, where all agents are free
+        rows = np.zeros(len(e), self.running.dtype)
+        rows["obs"] = obs[e]
+        rows["available"] = infos["available"][e]
+        rows["action"] = actions[e]
+        rows["since"] = np.where(free[e], k[:, None], since_before)
+        rows["discount"] = 1.0
+        self.running[e, k] = rows
+        self.running_rows[e] += 1
+
+    def add_step(self, rewards, discounts):
+        """Adds a time step to the latest row of every running episode.
+
+        rewards: float64 [N]. discounts: float64 [N], gamma, or 0 where the step terminated the episode.
+        """
+        latest = np.arange(len(rewards)), self.running_rows - 1
+        rows = self.running[latest]
+        rows["reward"] += rows["discount"] * rewards
+        rows["discount"] *= discounts
+        self.running[latest] = rows
+
+    def end_episodes(self, over, obs, infos):
+        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
+        self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
+        for e in np.flatnonzero(over):
+            self.ended.append(self.running[e, : self.running_rows[e]].copy())
+        self.running_rows[over] = 0
+
+    def state_dict(self):
+        """The rows that were written, for each episode as a tensor of bytes."""
+        running = [self.running[e, :length] for e, length in enumerate(self.running_rows)]
+        return {
+            "running": [torch.from_numpy(rows.view(np.uint8)) for rows in running],
+            "ended": [torch.from_numpy(rows.view(np.uint8)) for rows in self.ended],
         }
-        for name, shape in fields.items():
-            kind = int if name in ("action", "since") else np.float32
-            setattr(self, name, np.zeros((capacity + env.num_envs, env.horizon + 1, *shape), kind))
-        self.rows = np.zeros(capacity + env.num_envs, int)  # of each episode
-        self.queue, self.writing = np.split(np.arange(len(self.rows)), [capacity])
 
-    def add(self, obs, actions, chosen):
-        """Notes a row wherever an agent chooses: float32 [N, n, d], int64 [N, n], bool [N, n]."""
-        env = np.flatnonzero(chosen.any(1))
-        at = episode, row = self.writing[env], self.rows[self.writing[env]]
-        since = np.where(chosen[env], row[:, None], self.since[episode, row - 1])
-        self.obs[at], self.action[at], self.since[at] = obs[env], actions[env], since
-        self.reward[at], self.discount[at] = 0.0, 1.0
-        self.rows[episode] += 1
-
-    def step(self, rewards, discounts, over, obs, infos):
-        """Adds a step to the running rows, r += gamma^t r_t, and ends the episodes in over, bool [N], with a row for
-        their final observation. rewards, discounts: float64 [N], the latter gamma, 0 at a terminal step."""
-        at = self.writing, self.rows[self.writing] - 1
-        self.reward[at] += self.discount[at] * rewards
-        self.discount[at] *= discounts
-        self.add(obs, infos["macro_action"], infos["macro_done"] & over[:, None])
-        self.writing[over], self.queue = np.split(np.append(self.queue, self.writing[over]), [over.sum()])
-        self.rows[self.writing[over]] = 0
-
-    def take(self, device="cpu"):
-        """The ended episodes, once, as tensors [B, T, ...] by name. `valid` marks rows with a next one."""
-        episode = self.queue[self.rows[self.queue] > 0][:, None]  # [B, 1]
-        last = self.rows[episode] - 1  # [B, 1], the row of the final observation
-        row = np.arange(last.max() + 1)  # [T]
-        at = episode, np.minimum(row, last)
-        since = self.since[at]  # [B, T, n]
-        before = episode[..., None], since - 1, np.arange(since.shape[2])
-        batch = {key: getattr(self, key)[at] for key in ("obs", "action", "reward", "discount")}
-        previous = np.where(since > 0, self.action[before], -1)  # [B, T, n]
-        batch |= dict(valid=row < last, chosen=since == row[:, None], previous=previous)
-        self.rows[episode] = 0
-        return {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
+    def load_state_dict(self, saved):
+        """Goes on with what `state_dict` returned."""
+        for e, in_bytes in enumerate(saved["running"]):
+            rows = in_bytes.numpy().view(self.running.dtype)
+            self.running[e, : len(rows)] = rows
+            self.running_rows[e] = len(rows)
+        for in_bytes in saved["ended"]:
+            self.ended.append(in_bytes.numpy().view(self.running.dtype))
 
 
-def own_returns(batch, values, n_step):
-    """The agents' n-step returns over their own macro-actions, float32 [B, T, n]. That of agent i from row k on, where
-    it runs a macro-action, over l of its macro-actions, is X_l[k] = r[k] + gamma^tau (X_l[k + 1] if the macro-action
-    still runs at the next row, else X_{l-1}[k + 1]), X_0 being V'_i, as are all of them at the episode's final row.
-    values: float32 [B, T, n], V'_i of each agent's target critic. n_step: macro-actions in a return."""
+def make_batch(episodes, device="cpu"):
+    """Tensors [B, T, ...]: the fields of a row, and those below. Shorter episodes repeat their final row.
+
+    valid: bool [B, T], false at an episode's final row and its repeats. free: bool [B, T, n], agents that choose at the
+    row. previous: int64 [B, T, n], what an agent ran before its present macro-action, -1 for nothing.
+    """
+    length = np.array([len(episode) for episode in episodes])  # [B]
+    row = np.arange(length.max())  # [T]
+    rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
+    batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
+    since = batch["since"]  # [B, T, n]
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    batch["valid"] = row < length[:, None] - 1
+    batch["free"] = since == row[:, None]
+    batch["previous"] = np.where(since > 0, previous, -1)
+    return {name: torch.from_numpy(array).to(device) for name, array in batch.items()}
+
+
+def own_returns(values, batch, n_step):
+    """The agents' n-step returns over their own macro-actions, float32 [B, T, n].
+
+    X_l[k] is an agent's return from row k on over l macro-actions, of which the one that it runs at row k is the first.
+    If this one still runs at the next row, X_l[k] = r[k] + gamma^tau X_l[k + 1]. If it has ended, X_l[k] = r[k] +
+    gamma^tau X_{l-1}[k + 1]. X_0 is V'_i. At the final row every X_l is V'_i.
+
+    values: float32 [B, T, n], V'_i of each agent's target critic. n_step: the l of the returns.
+    """
     returns = torch.zeros_like(values)
-    later = values.new_zeros(n_step, *values[:, 0].shape)  # X_1 to X_n at the next row
-    final = batch["valid"].roll(1, 1) & ~batch["valid"]  # [B, T]
+    x = values.new_zeros(n_step, *values[:, 0].shape)  # X_1 to X_{n_step} at a row, [n_step, B, n]
     for k in reversed(range(values.shape[1] - 1)):
-        later = torch.where(final[:, k + 1, None], values[:, k + 1], later)
-        one_less = torch.cat([values[None, :, k + 1], later[:-1]])  # X_0 to X_{n-1}
-        later = torch.where(batch["chosen"][:, k + 1], one_less, later)
-        later = batch["reward"][:, k, None] + batch["discount"][:, k, None] * later  # [n_step, B, n]
-        returns[:, k] = later[-1]
+        next_value = values[:, k + 1]  # [B, n]
+        is_final = ~batch["valid"][:, k + 1, None]  # [B, 1]
+        x = torch.where(is_final, next_value, x)
+        one_less = torch.cat([next_value[None], x[:-1]])  # X_0 to X_{n_step - 1}
+        x = torch.where(batch["free"][:, k + 1], one_less, x)
+        x = batch["reward"][:, k, None] + batch["discount"][:, k, None] * x
+        returns[:, k] = x[-1]
     return returns
 
 
-def soft_policy(logits, epsilon):
-    """(1 - epsilon) softmax(logits) + epsilon uniform, float32 [..., A]; 0 for what an agent cannot do (-inf)."""
-    available = logits > -torch.inf
-    return (1 - epsilon) * logits.softmax(-1) + epsilon * available / available.sum(-1, keepdim=True)
+def soft_policy(logits, available, epsilon):
+    """(1 - epsilon) softmax + epsilon uniform, over what is available: probabilities float32 [..., A]."""
+    softmax = logits.masked_fill(~available, -torch.inf).softmax(-1)
+    uniform = available / available.sum(-1, keepdim=True)
+    return (1 - epsilon) * softmax + epsilon * uniform
 
 
-def actor_critic_loss(policy, values, returns, batch, entropy_coef):
-    """The loss of actors and critics, each summed over agents, a mean over the rows where the agent chose; the actors'
-    and the critics' loss, mean entropy. policy: float32 [B, T, n, A]. values, returns: float32 [B, T, n]."""
-    own = batch["chosen"] & batch["valid"][..., None]  # [B, T, n]
+def actor_critic_loss(policy, values, returns, batch, entropy_coef, hysteresis=1.0):
+    """Returns loss, actor_loss, critic_loss and entropy, all sums over agents of means over the agent's decisions.
 
-    def mean(x):  # over each agent's own decisions: [B, T, n] -> [n]
-        return torch.where(own, x, 0.0).sum((0, 1)) / own.sum((0, 1)).clamp(min=1)
-
-    taken = policy.gather(3, batch["action"][..., None])[..., 0]  # [B, T, n]
-    actor_loss = -mean(taken.clamp(min=1e-8).log() * (returns - values.detach())).sum()
-    critic_loss = mean((returns - values).square()).sum()
-    entropy = mean(-(policy * policy.clamp(min=1e-8).log()).sum(3))  # [n]
-    return actor_loss + critic_loss - entropy_coef * entropy.sum(), actor_loss, critic_loss, entropy.mean()
+    policy: float32 [B, T, n, A]. values, returns: float32 [B, T, n]. hysteresis: factor on critics' negative errors.
+    """
+    own = batch["free"] & batch["valid"][..., None]  # [B, T, n]
+    log_policy = policy.clamp(min=1e-8).log()
+    log_taken = log_policy.gather(-1, batch["action"][..., None])[..., 0]  # [B, T, n]
+    error = returns - values
+    actor_loss = -log_taken * error.detach()
+    critic_loss = torch.where(error < 0, hysteresis * error, error).square()
+    entropy = -(policy * log_policy).sum(-1)
+    terms = torch.stack([actor_loss, critic_loss, entropy])  # [3, B, T, n]
+    means = torch.where(own, terms, 0.0).sum((1, 2)) / own.sum((0, 1))  # [3, n]
+    actor_loss, critic_loss, entropy = means.sum(1)
+    loss = actor_loss + critic_loss - entropy_coef * entropy
+    return loss, actor_loss, critic_loss, entropy
 
 
 def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
-    """Macro-actions int64 [N, n], drawn from epsilon-soft policies or, without rng, the most likely, and recurrent
-    states float32 [n, N, H], moved where agents are free. obs, float32 [N, n, d], and infos are those of the
-    environment's last reset or step."""
-    free, running = infos["macro_done"], infos["macro_action"]
-    by_agent = [torch.from_numpy(x).to(hidden.device).transpose(0, 1) for x in (obs, running, free)]  # [n, N, ...]
+    """Macro-actions int64 [N, n] and new hidden states. A busy agent can only go on.
+
+    They are drawn from epsilon-soft policies or, without rng, the most likely macro-actions. obs: float32 [N, n, d].
+    infos: those of the last reset or step. hidden: float32 [n, N, H]; only those of free agents change.
+    """
+    free = infos["macro_done"]
+    own_obs = torch.from_numpy(obs).to(hidden.device).transpose(0, 1)[:, :, None]  # [n, N, 1, d]
+    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)  # used where free
+    available = torch.from_numpy(infos["available"]).to(hidden.device)
     with torch.no_grad():
-        logits, states = agents(*by_agent[:2], hidden, [len(obs)])
-    policy = soft_policy(logits, epsilon).transpose(0, 1).cpu().numpy()  # [N, n, A]
-    actions = policy.argmax(2)  # [N, n]
-    if rng:  # below the last bound, so that rounding cannot choose a macro-action that an agent has not
-        bounds = policy.cumsum(2)
-        actions = (rng.random(free.shape)[..., None] * bounds[..., -1:] >= bounds).sum(2)
-    return np.where(free, actions, running), torch.where(by_agent[2][..., None], states, hidden)
+        logits, new_hidden = agents(own_obs, previous, hidden)
+        policy = soft_policy(logits[:, :, 0].transpose(0, 1), available, epsilon).cpu().numpy()  # [N, n, A]
+    is_free = torch.from_numpy(free.T[..., None]).to(hidden.device)  # [n, N, 1]
+    hidden = torch.where(is_free, new_hidden, hidden)
+    if rng is None:
+        return policy.argmax(2), hidden
+    cumulative = policy.cumsum(2)  # ends at 1 but for rounding
+    draws = rng.random(free.shape)[..., None] * cumulative[..., -1:]
+    return (draws < cumulative).argmax(2), hidden
 
 
 def evaluate(agents, env, gamma, seed):
-    """Greedy play: return, discounted_return, length, success of each environment's first episode, float64 [N] each."""
+    """Greedy play of one episode in each environment: return, discounted_return, length, success, float64 [N] each."""
     obs, infos = env.reset(seed=seed)
-    hidden, live, step, result = agents.start(env.num_envs), np.ones(env.num_envs, bool), 0, {}
-    while live.any():
+    hidden = agents.start(env.num_envs)
+    running = np.ones(env.num_envs, bool)
+    names = ("return", "discounted_return", "length", "success")
+    result = {name: np.zeros(env.num_envs) for name in names}
+    step = 0
+    while running.any():
         actions, hidden = act(agents, obs, infos, hidden)
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        new = {"return": rewards, "discounted_return": gamma**step * rewards, "length": 1, "success": infos["success"]}
-        result = {key: result.get(key, 0.0) + live * value for key, value in new.items()}
+        result["return"] += running * rewards
+        result["discounted_return"] += running * gamma**step * rewards
+        result["length"] += running
+        result["success"] += running & infos["success"]  # true in one step of an episode at most
         over = terminations | truncations
-        live &= ~over
+        running &= ~over
         step += 1
-        obs, infos = env.reset(options={"reset_mask": over})  # play on in ended environments without looking
+        obs, infos = env.reset(options={"reset_mask": over})  # the next ones do not count
         hidden[:, over] = 0.0
     return result
 
 
 def make_learner(args, env):
-    """Actors and critics as one module on the device."""
-    (n, d), sizes = env.single_observation_space.shape, (args.hidden_size, args.obs_scale)
-    critics = Agents([1] * n, n * (d + 1 + max(env.n_actions)), *sizes)
-    return nn.ModuleDict({"agents": Agents(env.n_actions, d, *sizes), "critics": critics}).to(args.device)
+    """Actors and critics, as one module on the device."""
+    n_actions = max(env.n_actions)
+    obs_size = env.single_observation_space.shape[1]
+    agents = Agents(env.n_agents, n_actions, obs_size, args.hidden_size, args.obs_scale)
+    critics = Critics(env.n_agents, n_actions, obs_size, args.hidden_size, args.obs_scale)
+    return nn.ModuleDict({"agents": agents, "critics": critics}).to(args.device)
 
 
-def train(args, stop=()):
-    """Trains from Args, or goes on with the run args.resume, until something is in stop; returns the run folder."""
+def train(args):
+    """Trains, or goes on with the run in args.resume, and returns the run's folder."""
     torch.set_num_threads(1)  # fastest for networks of this size
-    torch.manual_seed(args.seed)
-    rng = np.random.default_rng(args.seed)
-    env, eval_env = envs.make(args.env, args.num_envs), envs.make(args.env, args.eval_episodes)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda: there is none")
+    seeds = np.random.SeedSequence(args.seed).generate_state(4, np.uint64).tolist()
+    network_seed, explore_seed, env_seed, eval_seed = seeds  # no two purposes share random numbers
+    torch.manual_seed(network_seed)
+    explore_rng = np.random.default_rng(explore_seed)
+    env = envs.make(args.env, args.num_envs)
+    eval_env = envs.make(args.env, args.eval_episodes)
     learner = make_learner(args, env)
-    target, agents = copy.deepcopy(learner["critics"]).requires_grad_(False), learner["agents"]
-    fast, slow = list(learner.parameters()), list(target.parameters())
-    optimizer = torch.optim.Adam(fast, lr=args.learning_rate, fused=True)
-    buffer = EpisodeBuffer(env, args.batch_size + args.num_envs)
-    step_gamma, row_gamma = (args.gamma, 1.0) if args.discount == "step" else (1.0, args.gamma)
-    obs, infos = env.reset(seed=args.seed)
-    hidden, step, updates, recent, best = agents.start(args.num_envs), 0, 0, [], -np.inf
-    folder = Path(args.resume or f"{args.runs_dir}/{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}")
+    target = copy.deepcopy(learner["critics"]).requires_grad_(False)  # the target critics, without gradients
+    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
+    buffer = EpisodeBuffer(env)
+    parts = {
+        "learner": learner,
+        "target": target,
+        "optimizer": optimizer,
+        "buffer": buffer,
+    }
+    obs, infos = env.reset(seed=env_seed)
+    hidden = learner["agents"].start(args.num_envs)
+    step = 0
+    updates = 0
+    best_return = -np.inf
+    run_name = f"{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}".replace(":", "-")
+    folder = Path(args.resume or f"{args.runs_dir}/{run_name}")
+    if args.resume:
+        saved = load(folder / "checkpoint.pt")
+        for name, part in parts.items():
+            part.load_state_dict(saved[name])
+        obs, infos = env.load_state(saved["env"])
+        hidden = saved["hidden"].to(args.device)
+        explore_rng.bit_generator.state = saved["explore_rng"]
+        step, updates, best_return = saved["progress"]
+    else:
+        folder.mkdir(parents=True)
+        (folder / "args.json").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
     if args.track:
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    if args.resume:
-        saved = load(folder / "checkpoint.pt")
-        for part, state in zip((learner, target, optimizer), saved["parts"], strict=True):
-            part.load_state_dict(state)
-        vars(buffer).update({key: value.numpy() for key, value in saved["buffer"].items()})
-        obs, infos = env.load_state(saved["env"])
-        rng.bit_generator.state, hidden = saved["rng"], saved["hidden"].to(args.device)
-        step, updates, recent, best = saved["counts"]
-    else:
-        folder.mkdir(parents=True)
-        (folder / "args.json.new").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
-        (folder / "args.json.new").replace(folder / "args.json")
-    writer = SummaryWriter(folder, purge_step=step + 1)
-    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # none where there is no terminal
-    time0, step0, saved_at = time.time(), step, time.time()
-
-    def log(group, **values):
-        for key, value in values.items():
-            writer.add_scalar(f"{group}/{key}", value, step)
+    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    print(folder)
+    bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
+    saved_at = -np.inf  # so there is a checkpoint from the first step on
 
     while step < args.total_timesteps:
-        # Choose and step
-        epsilon = np.interp(step, [0, args.exploration_timesteps], [args.start_e, args.end_e])
-        done = step / args.total_timesteps
-        optimizer.param_groups[0]["lr"] = args.learning_rate * (1 + done * (args.learning_rate_end - 1))
-        actions, hidden = act(agents, obs, infos, hidden, epsilon, rng)
-        buffer.add(obs, actions, infos["macro_done"])
+        # ---- act: one time step in every environment ----
+        phase = (step - args.random_timesteps) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        epsilon = np.interp(phase, [0, 1], [args.start_e, args.end_e]) if phase >= 0 else 1.0
+        actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
+        buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
         obs, rewards, terminations, truncations, infos = env.step(actions)
-        over = terminations | truncations
-        buffer.step(args.reward_scale * rewards, step_gamma * ~terminations, over, obs, infos)
+        buffer.add_step(args.reward_scale * rewards, np.where(terminations, 0.0, args.gamma))
         step += args.num_envs
         bar.update(args.num_envs)
+        over = terminations | truncations
         if over.any():
-            recent += env.episode_return[over].tolist()
+            buffer.end_episodes(over, obs, infos)
+            writer.add_scalar("charts/episodic_return", env.episode_return[over].mean(), step)
             obs, infos = env.reset(options={"reset_mask": over})
             hidden[:, over] = 0.0
 
-        # Learn from the episodes that ended, once
-        if np.count_nonzero(buffer.rows[buffer.queue]) >= args.batch_size:
-            batch = buffer.take(args.device)
-            batch["discount"] *= row_gamma
-            joint = joint_batch(batch, max(env.n_actions))
-            values, target_values = (x[..., 0] for x in over_rows(joint, learner["critics"], target))  # [B, T, n]
-            policy = soft_policy(over_rows(batch, agents)[0], epsilon)  # [B, T, n, A]
-            returns = own_returns(batch, target_values, args.n_step)
-            losses = actor_critic_loss(policy, values, returns, batch, args.entropy_coef)
+        # ---- learn: an update on the episodes that have ended, once there are batch_size ----
+        if len(buffer.ended) >= args.batch_size:
+            if args.anneal_lr:
+                optimizer.param_groups[0]["lr"] = args.learning_rate * max(0.0, 1 - step / args.total_timesteps)
+            hysteresis = np.interp(phase, [1, 2], [args.hysteresis, 1.0])
+            batch = make_batch(buffer.ended, args.device)
+            buffer.ended.clear()
+            policy = soft_policy(logits_at_rows(learner["agents"], batch), batch["available"], epsilon)
+            values = learner["critics"](batch)  # [B, T, n]
+            returns = own_returns(target(batch), batch, args.n_step)
+            losses = actor_critic_loss(policy, values, returns, batch, args.entropy_coef, hysteresis)
+            loss, actor_loss, critic_loss, entropy = losses
             optimizer.zero_grad()
-            losses[0].backward()
-            grad_norm = nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
+            loss.backward()
+            grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
             optimizer.step()
-            critics = list(learner["critics"].parameters())
-            torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)(slow, critics, None)
+            for slow, fast in zip(target.parameters(), learner["critics"].parameters(), strict=True):
+                slow.lerp_(fast.detach(), 1 - args.polyak)
             updates += 1
             if updates % 10 == 0:
-                q_values = values[batch["valid"]].mean()
-                log("losses", td_loss=losses[2], q_values=q_values, grad_norm=grad_norm)
-                log("losses", actor_loss=losses[1], entropy=losses[3])
+                writer.add_scalar("losses/actor_loss", actor_loss, step)
+                writer.add_scalar("losses/critic_loss", critic_loss, step)
+                writer.add_scalar("losses/entropy", entropy, step)
+                writer.add_scalar("losses/values", values[batch["valid"]].mean(), step)
+                writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # Log, evaluate, save
-        if step % 2_000 < args.num_envs and recent:
-            log("charts", SPS=(step - step0) / (time.time() - time0), epsilon=epsilon, episodic_return=np.mean(recent))
-            recent = []
+        # ---- evaluate, log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
-            seed = args.seed * 10**9 + step  # fresh episodes
-            result = {key: x.mean().item() for key, x in evaluate(agents, eval_env, args.gamma, seed).items()}
-            log("eval", **result)
+            episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
+            result = {name: values.mean().item() for name, values in episodes.items()}
+            for name, value in result.items():
+                writer.add_scalar(f"eval/{name}", value, step)
+            writer.add_scalar("charts/epsilon", epsilon, step)
+            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
             model = dict(step=step, networks=learner.state_dict(), **result)
             save(folder / "last.pt", args, **model)
-            if result["return"] >= best:
-                best = result["return"]
+            if result["return"] >= best_return:
+                best_return = result["return"]
                 save(folder / "best.pt", args, **model)
-            bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
-        if time.time() - saved_at > args.checkpoint_frequency or stop:
-            writer.flush()  # what was logged up to here is not logged again after a resume
-            arrays = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in env.save_state().items()}
-            parts = [part.state_dict() for part in (learner, target, optimizer)]
-            memory = {key: torch.from_numpy(value) for key, value in vars(buffer).items()}
-            save(folder / "checkpoint.pt", args, parts=parts, buffer=memory, env=arrays, hidden=hidden,
-                 rng=rng.bit_generator.state, counts=(step, updates, recent, best))  # fmt: skip
-            saved_at = time.time()
-            if stop:
-                break
+        if time.monotonic() - saved_at > args.checkpoint_frequency:
+            writer.flush()  # what was logged up to here outlives a kill
+            save(
+                folder / "checkpoint.pt",
+                args,
+                **{name: part.state_dict() for name, part in parts.items()},
+                env={name: torch.from_numpy(array) for name, array in env.save_state().items()},
+                hidden=hidden,
+                explore_rng=explore_rng.bit_generator.state,
+                progress=(step, updates, best_return),
+            )
+            saved_at = time.monotonic()
 
     bar.close()
     writer.close()
-    if step >= args.total_timesteps:
-        (folder / "checkpoint.pt").unlink(missing_ok=True)
+    (folder / "checkpoint.pt").unlink(missing_ok=True)
     return folder
 
 
 def save(path, args, **content):
-    """Writes beside the file and swaps, so that a kill at any moment leaves the old one or the new one."""
+    """Writes beside the file and swaps, so that a kill at any moment leaves the old file or the new one."""
     torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, f"{path}.new")
     Path(f"{path}.new").replace(path)
 
@@ -427,38 +551,37 @@ def load(path):
         saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
         if saved["algorithm"] != ALGORITHM:
             raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
-        Args(**saved["args"])  # fails where a setting is not one of this version
+        Args(**saved["args"])  # raises TypeError if a setting is of another version
         return saved
-    except Exception as error:  # torch names no common class for what a damaged file raises
+    except Exception as error:  # a damaged file raises errors of many classes
         raise SystemExit(f"cannot read {path}: {error}".splitlines()[0]) from None
 
 
 def parse_args(argv=None):
-    """Args from the command line, over the defaults of the task or the settings of the run to go on with."""
+    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
     known, others = peek.parse_known_args(argv)
-    if known.resume and (known.env or others):
-        raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
     if known.resume:
-        return Args(**load(Path(known.resume) / "checkpoint.pt")["args"] | {"resume": known.resume})
+        if known.env or others:
+            raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
+        saved = load(Path(known.resume) / "checkpoint.pt")
+        return Args(**{**saved["args"], "resume": known.resume})
     env = known.env or Args.env
-    defaults = next((row for start, row in DEFAULTS.items() if env.startswith(start)), {})
-    args = tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
-    if args.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("--device cuda: there is none")
-    return args
+    defaults = {}
+    for beginning, values in DEFAULTS.items():
+        if env.startswith(beginning):
+            defaults = values
+    return tyro.cli(Args, default=Args(env=env, **defaults), args=argv)
 
 
 if __name__ == "__main__":
-    stop = []  # Ctrl-C or a termination signal: end between two steps, where a checkpoint is whole
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: stop.append(number))
+    args = parse_args()
     try:
-        print(folder := train(parse_args(), stop))
+        train(args)
     except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
         raise SystemExit(error) from None
-    if (folder / "checkpoint.pt").exists():
-        print(f"stopped; go on with: python {ALGORITHM}.py --resume {folder}", file=sys.stderr)
-        sys.exit(128 + stop[0])
+    except KeyboardInterrupt:
+        print("stopped; --resume with the run's folder goes on from its last checkpoint", file=sys.stderr)
+        sys.exit(130)

@@ -88,5 +88,6 @@ register("ct-10", CaptureTarget, n_agents=10)
 register("bp-10-primitive", BoxPushing, grid=10, primitive=True)
 register("wtd-s-primitive", Warehouse, layout="s", primitive=True)
 register("ct-10-primitive", CaptureTarget, n_agents=10, primitive=True)
+register("ct-10-onestep", CaptureTarget, n_agents=10, one_step=True)
 
 IDS = tuple(_TASKS)  # the benchmark's tasks, without those that are registered later

@@ -1,62 +1,128 @@
-"""Box Pushing: two robots on a grid, two small boxes that pay a little and a big one that takes both and pays a lot."""
+"""Box Pushing: two robots push boxes north.
+
+Each alone can push a small box, for a small reward. Both together can push the big box, for a large reward.
+"""
 
 import numpy as np
 
+from envs import checks
 from envs.core import MacroVectorEnv
 
-# Orientations 0 N, 1 E, 2 S, 3 W and the step forward in each, x to the east and y to the north.
-NORTH = 0
+# Orientations, and one step forward (x, y) in each of them: x to the east, y to the north.
+NORTH, EAST, SOUTH, WEST = range(4)
 FORWARD = np.array([(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)])
-TURN_COST = np.array([np.roll([0.0, 0.1, 0.2, 0.1], turned) for turned in range(4)])  # [orientation, direction]
-PUSH, TURN_LEFT, TURN_RIGHT, STAY = 4, 5, 6, 7  # below: Go-to, numbered as the waypoints
+
+# Macro-actions 0 to 3 are the Go-tos. Each has the number of the waypoint to which it leads.
+MACRO_ACTION_NAMES = [
+    "Go-to-Small-Box(0)",
+    "Go-to-Small-Box(1)",
+    "Go-to-Big-Box(left)",
+    "Go-to-Big-Box(right)",
+    "Push",
+    "Turn-left",
+    "Turn-right",
+    "Stay",
+]
 WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT = 2, 3
+PUSH, TURN_LEFT, TURN_RIGHT, STAY = 4, 5, 6, 7
+
+# A primitive action does one step of the macro-action that has its place in PRIMITIVE_TO_MACRO.
+PRIMITIVE_NAMES = ["Forward", "Turn-left", "Turn-right", "Stay"]
 PRIMITIVE_TO_MACRO = np.array([PUSH, TURN_LEFT, TURN_RIGHT, STAY])
+
+# What turning costs Go-to, by the number of quarter turns to the right. Three of them are one to the left.
+TURN_COST = np.array([0.0, 0.1, 0.2, 0.1])
+SMALL, BIG = slice(0, 2), 2  # boxes 0 and 1 are small, box 2 is big
 
 
 class BoxPushing(MacroVectorEnv):
-    """Two agents push boxes to the north wall of a `grid` x `grid` world (`bp-10`, `bp-20`, `bp-30`).
+    """Two agents push boxes to the northernmost row of a grid x grid world (`bp-10`, `bp-20`, `bp-30`).
 
     ## Description
-    Either agent can push a small box alone; the big box, two cells wide, moves only when both push it at once.
-    Positions are cell centres (0.5, 1.5, ...), x to the east, y to the north. Agents do not block each other.
+    One agent alone can push a small box. The big box is two cells wide and moves only when both agents push it.
+    Boxes move north only. Agents do not block each other. Positions are cell centres (0.5, 1.5, ...), x to the east
+    and y to the north. The goal row is the northernmost row. Each step, in this order:
+
+    1. If the agents begin a joint push (see below), they are locked onto the big box from now on.
+    2. Agent 0 acts, then agent 1. Agents that are locked onto the big box do nothing here.
+    3. If the agents are locked onto the big box, it moves one cell north, and both agents move with it.
+    4. The episode terminates if a box stands on the goal row.
 
     ## Macro-actions
-    0, 1 Go-to-Small-Box(0, 1), 2, 3 Go-to-Big-Box(left, right): walk to the cell below the box and face it. 4 Push:
-    walk forward until a wall, or with a small box to the goal row; bumping into the big box, or into any box from the
-    side, costs a penalty and ends it. If both agents start Push in the same step, both facing north, and the last
-    waypoints they reached are 2 and 3, they push the big box together to the goal row (the last waypoint, not the
-    position, is what
-    counts: a quirk of the published benchmark, kept). 5 Turn-left, 6 Turn-right, 7 Stay last one step.
-    `primitive=True`: 0 forward, 1 turn left, 2 turn right, 3 stay; the big box moves while both agents stand below its
-    two cells, face north and move forward together.
+    - 0, 1 Go-to-Small-Box(0, 1) and 2, 3 Go-to-Big-Box(left, right): the agent walks to its waypoint and ends there
+      facing north. The waypoint is the cell below the place where the small box, or that half of the big box, was at
+      the start. It does not move with the box. An agent that is at its waypoint when a step begins turns north in this
+      step, whatever its orientation, and ends. Any other looks at its four neighbour cells in the order N, E, S, W:
+        - The cost of a cell is its Manhattan distance to the waypoint, plus 0.1 for each quarter turn that the agent
+          needs to face it.
+        - A cell costs infinitely much if it has the y of small box 0 and the x of a small box or of either half of the
+          big one. At the start of the published benchmark these are the cells of all boxes.
+        - The agent chooses the cheapest cell, the first of equals. If it faces the cell, it moves there. If the cell is
+          behind it, it makes one quarter turn to the right. Otherwise it turns to face the cell.
+    - 4 Push: what it does depends on the cell in front of the agent.
+        - A small box, and the agent faces north: the box and the agent move one cell north. Push ends when the box is
+          on the goal row.
+        - The boundary of the grid, the big box, or a small box while the agent does not face north: the agent stays
+          where it is, gets a penalty, and Push ends.
+        - Anything else: the agent moves one cell forward. Push ends when it then has the boundary in front of it.
+    - Joint push: it begins if both agents start Push in the same step, both face north, and one of them last reached
+      the left waypoint of the big box and the other one the right waypoint. The agents may have left these waypoints
+      since. This is a quirk of the published benchmark, and it is kept. A joint push goes on until the big box is on
+      the goal row.
+    - 5 Turn-left, 6 Turn-right, 7 Stay: they last one step.
+
+    With `primitive=True` the actions are 0 Forward, 1 Turn-left, 2 Turn-right and 3 Stay, one step each. Forward is one
+    step of Push. The big box moves one cell if one agent stands below its left half and the other one below its right
+    half, and both face north and move Forward in the same step.
 
     ## Macro-observations
-    Five bits about the cell in front: small box, big box, empty, boundary, teammate. At a reset: empty.
+    Five bits say what is in the cell in front of the agent: a small box, the big box, nothing, the boundary, the
+    teammate. At a reset every agent observes "nothing".
 
     ## Rewards
-    `step_cost` every step (the published benchmark has it, the paper does not mention it), `penalty` for each agent
-    that walks into a wall or bumps into a box it cannot move, `small_reward` for each small box on the goal row and
-    `big_reward` for the big one.
+    The reward of a step is the sum of these. By default `step_cost` and `penalty` are negative.
+
+    - `step_cost` every step. The paper (see Source) does not mention it, but the published benchmark has it.
+    - `penalty` for each agent that gets a penalty in the step.
+    - `small_reward` for each small box on the goal row, `big_reward` for the big one.
 
     ## Episode end
-    Terminated when any box stands on the goal row (`success`: the big one); truncated after `horizon` steps.
+    The episode is terminated when any box stands on the goal row; it is a `success` if the big box does. It is
+    truncated after `horizon` steps.
 
-    ## State (27 numbers)
-    0-11 for each agent x/grid, y/grid and its orientation one-hot (4); 12-17 for each box (small 0, small 1, big)
-    x/grid, y/grid; 18-25 for each agent the last waypoint it reached, one-hot (4, all 0 before the first); 26 whether
-    the two are pushing the big box. The last nine are not in the benchmark's state: without them it would not be
-    Markov.
+    ## State
+    27 numbers. The published benchmark's state has only the first 18. The other nine are there to make it Markov.
+
+    - 0 to 11: for each agent x / grid, y / grid and its orientation, one-hot (4)
+    - 12 to 17: for each box (small 0, small 1, big) x / grid, y / grid
+    - 18 to 25: for each agent the waypoint that it reached last, one-hot (4), all 0 before the first
+    - 26: whether the agents are locked onto the big box
 
     ## Arguments
-    grid: even, at least 6. primitive: the primitive-action version. horizon, big_reward, small_reward, penalty,
-    step_cost: as above. agent_starts, agent_orientations, small_boxes, big_box: the layout, cell centres (the big box:
-    the middle of its two cells); None for the published one. The waypoints are the cells below the boxes.
+    - num_envs: the number of environments N, at least 1
+    - grid: cells along each axis, an even number of at least 6
+    - primitive: whether to use the primitive actions
+    - horizon: steps until truncation, at least 1
+    - big_reward, small_reward, penalty, step_cost: as above
+    - agent_starts: the cells of the two agents at the start [2, (x, y)]
+    - agent_orientations: their orientations at the start [2], 0 N, 1 E, 2 S, 3 W
+    - small_boxes: the cells of the two small boxes at the start [2, (x, y)]
+    - big_box: the middle of the big box's two cells at the start (x, y)
+    - render_mode: None or "rgb_array"
+
+    None for `agent_starts`, `small_boxes` or `big_box` means the places of the published benchmark. A box must start
+    below the goal row. It must start above the lowest row, too, because its waypoint is the cell below it. A bad
+    argument raises a ValueError.
 
     ## Simulator arrays
-    position float64 [N, 2, 2], orientation int64 [N, 2], box_y float64 [N, 3] (boxes only ever move north),
-    last_waypoint int64 [N, 2] (-1: none), pushing_big bool [N].
+    - position float64 [N, 2, (x, y)] and orientation int64 [N, 2] of the agents
+    - box_y float64 [N, 3] of the boxes, whose x never changes
+    - last_waypoint int64 [N, 2]: the waypoint that each agent reached last, -1 before the first
+    - pushing_big bool [N]: whether the agents are locked onto the big box
 
-    Source: Xiao et al., Macro-Action-Based Deep Multi-Agent RL (CoRL 2019); the paper's Appendix D.1.
+    ## Source
+    Y. Xiao, J. Hoffman, C. Amato, "Macro-Action-Based Deep Multi-Agent Reinforcement Learning", CoRL 2019. Rewards and
+    constants are those of Appendix D.1 of "the paper", the one on asynchronous value factorization.
     """
 
     sim_arrays = ("position", "orientation", "box_y", "last_waypoint", "pushing_big")
@@ -73,169 +139,261 @@ class BoxPushing(MacroVectorEnv):
         penalty=-10.0,
         step_cost=-0.1,
         agent_starts=None,
-        agent_orientations=(1, 3),
+        agent_orientations=(EAST, WEST),
         small_boxes=None,
         big_box=None,
         render_mode=None,
     ):
-        if grid < 6 or grid % 2:
-            raise ValueError(f"grid must be an even number of at least 6 cells, got {grid}")
-        names = ["Go-to-Small-Box(0)", "Go-to-Small-Box(1)", "Go-to-Big-Box(left)", "Go-to-Big-Box(right)"]
-        names += ["Push", "Turn-left", "Turn-right", "Stay"]
-        names = ["Forward", "Turn-left", "Turn-right", "Stay"] if primitive else names
-        super().__init__(num_envs, [names] * 2, np.zeros((2, 5)), np.ones((2, 5)), (5, 5), 27, horizon, render_mode)
-        self.grid, self.primitive = grid, primitive
-        self.penalty, self.step_cost = penalty, step_cost
-        self._box_rewards = np.array([small_reward, small_reward, big_reward])
-        self.goal_y = grid - 0.5
-        row = grid / 2 + 0.5
-        self._starts = np.array(agent_starts or [(1.5, 1.5), (grid - 1.5, 1.5)], float)  # [2, (x, y)]
-        self._orientations = np.array(agent_orientations)
-        boxes = [*(small_boxes or [(1.5, row), (grid - 1.5, row)]), big_box or (grid / 2, row)]
-        self._boxes = np.array(boxes, float)  # [3, (x, y)]
-        if self._starts.shape != (2, 2) or self._orientations.shape != (2,) or self._boxes.shape != (3, 2):
-            raise ValueError("a layout has two agents with an orientation each, two small boxes and one big box")
-        # The four box cells in the order of the waypoints below them: small 0, small 1, big left, big right.
-        self.cell_x = np.append(self._boxes[:2, 0], self._boxes[2, 0] + np.array([-0.5, 0.5]))
-        self._cell_box = np.array([0, 1, 2, 2])
-        self.waypoints = np.stack([self.cell_x, self._boxes[self._cell_box, 1] - 1.0], axis=1)  # [4, (x, y)]
-        cells = np.concatenate([self._starts, self.waypoints, np.stack([self.cell_x, self.waypoints[:, 1] + 1], 1)])
-        if (cells % 1 != 0.5).any() or (cells < 0).any() or (cells > grid).any():
-            raise ValueError("agents, boxes and the cells below the boxes must be cell centres inside the grid")
-        if (self._boxes[:, 1] >= self.goal_y).any():
-            raise ValueError("boxes must start below the goal row")
+        self.primitive = checks.flag("primitive", primitive)
+        self.grid = checks.whole("grid", grid, low=6)
+        if self.grid % 2 == 1:
+            raise ValueError(f"grid must be even, got {grid}")
+        self.goal_y = self.grid - 0.5
+        self.penalty = checks.numbers("penalty", penalty)
+        self.step_cost = checks.numbers("step_cost", step_cost)
+        self.small_reward = checks.numbers("small_reward", small_reward)
+        self.big_reward = checks.numbers("big_reward", big_reward)
+        self._place_agents_and_boxes(agent_starts, agent_orientations, small_boxes, big_box)
+        names = PRIMITIVE_NAMES if self.primitive else MACRO_ACTION_NAMES
+        super().__init__(
+            num_envs=checks.whole("num_envs", num_envs),
+            macro_action_names=[names, names],
+            obs_low=np.zeros((2, 5)),
+            obs_high=np.ones((2, 5)),
+            obs_sizes=(5, 5),
+            state_size=27,
+            horizon=checks.whole("horizon", horizon),
+            render_mode=render_mode,
+        )
+        self.position = np.zeros((self.num_envs, 2, 2))
+        self.orientation = np.zeros((self.num_envs, 2), np.int64)
+        self.box_y = np.zeros((self.num_envs, 3))
+        self.last_waypoint = np.full((self.num_envs, 2), -1)
+        self.pushing_big = np.zeros(self.num_envs, bool)
 
-        self._box_column = np.isin(np.arange(grid + 1) + 0.5, self.cell_x)  # by floor(x), one more beyond the wall
+    def _place_agents_and_boxes(self, agent_starts, agent_orientations, small_boxes, big_box):
+        """Sets where agents and boxes start, and the waypoints. The arguments are those of the constructor."""
+        right_x = self.grid - 1.5
+        box_y = self.grid / 2 + 0.5
+        if agent_starts is None:
+            agent_starts = [(1.5, 1.5), (right_x, 1.5)]
+        if small_boxes is None:
+            small_boxes = [(1.5, box_y), (right_x, box_y)]
+        if big_box is None:
+            big_box = (self.grid / 2, box_y)
 
-        self.position, self.orientation = np.zeros((num_envs, 2, 2)), np.zeros((num_envs, 2), np.int64)
-        self.box_y = np.zeros((num_envs, 3))
-        self.last_waypoint, self.pushing_big = np.full((num_envs, 2), -1), np.zeros(num_envs, bool)
+        self.starts = checks.numbers("agent_starts", agent_starts, (2, 2))
+        self.start_orientations = checks.whole("agent_orientations", agent_orientations, (2,), low=NORTH, high=WEST)
+        small = checks.numbers("small_boxes", small_boxes, (2, 2))
+        big = checks.numbers("big_box", big_box, (2,))
+        half_a_cell = np.array([0.5, 0.0])
+        big_halves = np.stack([big - half_a_cell, big + half_a_cell])  # [left and right, (x, y)]
+
+        last = self.grid - 0.5  # the centre of the last cell along an axis
+        _check_cells("agent_starts", agent_starts, self.starts, lowest=(0.5, 0.5), highest=(last, last))
+        _check_cells("small_boxes", small_boxes, small, lowest=(0.5, 1.5), highest=(last, last - 1))
+        _check_cells("the two cells of big_box", big_box, big_halves, lowest=(0.5, 1.5), highest=(last, last - 1))
+
+        box_cells = np.concatenate([small, big_halves])  # [4, (x, y)]: small 0 and 1, left and right half
+        self.cell_x = box_cells[:, 0]
+        self.waypoints = box_cells - (0.0, 1.0)  # [4, (x, y)], below these cells
+        boxes = np.concatenate([small, big[None]])  # [3, (x, y)]: small 0, small 1, big
+        self.box_x = boxes[:, 0]
+        self.start_box_y = boxes[:, 1]
 
     def _reset(self, mask):
-        self.position[mask], self.orientation[mask] = self._starts, self._orientations
-        self.box_y[mask] = self._boxes[:, 1]
-        self.last_waypoint[mask], self.pushing_big[mask] = -1, False
+        self.position[mask] = self.starts
+        self.orientation[mask] = self.start_orientations
+        self.box_y[mask] = self.start_box_y
+        self.last_waypoint[mask] = -1
+        self.pushing_big[mask] = False
 
+    # ---- the rules, in the order of a step ----------------------------------------------------------------------
     def _advance(self):
-        action = PRIMITIVE_TO_MACRO[self.macro_action] if self.primitive else self.macro_action  # [N, agents]
-        self._lock_onto_big_box(action)
-        locked = self.pushing_big[:, None]
-        ended = (action >= TURN_LEFT) | self.primitive
-        # Agents act in turn. Go-to reads boxes, Push moves them, and an agent does one of the two: agent 0's push, both
-        # walks, agent 1's push have the same outcome as agent 0, then agent 1.
-        push = (action == PUSH) & ~locked
-        penalties = self._push(0, push[:, 0], ended)
-        if not self.primitive:
-            self._go_to(action, ended)
-        penalties += self._push(1, push[:, 1], ended)
-        turn = (action == TURN_RIGHT).view(np.int8) - (action == TURN_LEFT).view(np.int8)
-        self.orientation += turn
-        self.orientation &= 3
-
-        self.position[:, :, 1] += locked
-        self.box_y[:, 2] += self.pushing_big
-        arrived = self.box_y >= self.goal_y  # [N, boxes]
-        ended |= locked & arrived[:, 2:]
-        terminated = arrived.any(1)
+        action = self.macro_action  # [N, agents]
         if self.primitive:
+            action = PRIMITIVE_TO_MACRO[self.macro_action]
+        self._lock_onto_big_box(action)
+
+        ended = np.zeros((self.num_envs, 2), bool)
+        penalised = np.zeros((self.num_envs, 2), bool)
+        for agent in range(2):
+            go_to_ended = self._go_to(agent, action[:, agent])
+            push_ended, push_penalised = self._push(agent, action[:, agent])
+            turns_or_stays = self._turn_or_stay(agent, action[:, agent])
+            ended[:, agent] = go_to_ended | push_ended | turns_or_stays
+            penalised[:, agent] = push_penalised
+
+        self._push_big_box()
+        # A small box can be beyond the goal row. If agent 1 stands in the cell of the box, agent 0 can push the box one
+        # cell north and then agent 1 one cell more, in the same step.
+        on_goal_row = self.box_y >= self.goal_y  # [N, boxes]
+        small_on_goal_row = on_goal_row[:, SMALL]
+        big_on_goal_row = on_goal_row[:, BIG]
+        joint_push_ended = self.pushing_big & big_on_goal_row
+        ended |= joint_push_ended[:, None]
+        if self.primitive:  # every action ends after its step, and so does a joint push
+            ended[:] = True
             self.pushing_big[:] = False
-        rewards = self.penalty * penalties + arrived @ self._box_rewards + self.step_cost
-        return rewards, terminated, ended, arrived[:, 2]
+
+        rewards = self.penalty * np.count_nonzero(penalised, axis=1)
+        rewards += self.small_reward * np.count_nonzero(small_on_goal_row, axis=1)
+        rewards += np.where(big_on_goal_row, self.big_reward, 0.0)
+        rewards += self.step_cost
+        terminations = on_goal_row.any(axis=1)
+        return rewards, terminations, ended, big_on_goal_row
 
     def _lock_onto_big_box(self, action):
-        """Both agents start to push the big box together."""
-        both = ((action == PUSH) & (self.orientation == NORTH) & self.macro_done).all(1)
-        if self.primitive:
-            below = (self.position[:, :, 1] == self.box_y[:, 2:] - 1).all(1)
+        """Begins a joint push where both agents start Push and face north, one at each half of the big box."""
+        both_start_push = (self.macro_done & (action == PUSH)).all(axis=1)
+        both_face_north = (self.orientation == NORTH).all(axis=1)
+        if self.primitive:  # the agents' cells count
             x = self.position[:, :, 0]
-            left, right = self.cell_x[WAYPOINT_BIG_LEFT], self.cell_x[WAYPOINT_BIG_RIGHT]
-            placed = below & ((x == (left, right)).all(1) | (x == (right, left)).all(1))
-        else:
-            # Waypoints are at most 3, so this sum is that of 2 and 3 only.
-            placed = self.last_waypoint.sum(1) == WAYPOINT_BIG_LEFT + WAYPOINT_BIG_RIGHT
-        self.pushing_big |= both & placed
+            y = self.position[:, :, 1]
+            is_below = y == self.box_y[:, BIG, None] - 1  # [N, agents]
+            at_left_half = is_below & (x == self.cell_x[WAYPOINT_BIG_LEFT])
+            at_right_half = is_below & (x == self.cell_x[WAYPOINT_BIG_RIGHT])
+        else:  # the waypoints that they reached last count
+            at_left_half = self.last_waypoint == WAYPOINT_BIG_LEFT
+            at_right_half = self.last_waypoint == WAYPOINT_BIG_RIGHT
+        one_at_each_half = at_left_half.any(axis=1) & at_right_half.any(axis=1)
+        self.pushing_big |= both_start_push & both_face_north & one_at_each_half
 
-    def _outside(self, cell):
-        """Whether cells, [..., (x, y)], lie outside the grid."""
-        out = (cell < 0) | (cell > self.grid)
-        return out[..., 0] | out[..., 1]
+    def _go_to(self, agent, action):
+        """One step of Go-to in the environments where the agent runs it; returns where it ends, bool [N]."""
+        position = self.position[:, agent]  # these two are views: writing to them moves the agent
+        orientation = self.orientation[:, agent]
+        goes = action < PUSH  # macro-actions 0 to 3
+        waypoint = self.waypoints[np.where(goes, action, 0)]  # [N, (x, y)]; unused where nobody goes
+        cheapest = self._cheapest_direction(position, orientation, waypoint)
 
-    def _box_ahead(self, front):
-        """Whether the cell in front, [N, ..., (x, y)], holds each of the four box cells: bool [N, ..., 4]."""
-        cell_y = self.box_y[:, self._cell_box]  # [N, 4]
-        cell_y = cell_y.reshape(self.num_envs, *[1] * (front.ndim - 2), 4)  # [N, 1 ..., 4]
-        return (front[..., :1] == self.cell_x) & (front[..., 1:] == cell_y)
+        is_there = goes & (position == waypoint).all(axis=1)
+        walks = goes & ~is_there
+        is_ahead = cheapest == orientation
+        is_behind = cheapest == (orientation + 2) % 4
+        moves = walks & is_ahead
+        turns_right = walks & is_behind
+        faces_it = walks & ~is_ahead & ~is_behind
+        orientation[is_there] = NORTH
+        position[moves] += FORWARD[cheapest[moves]]
+        orientation[turns_right] += 1
+        orientation[faces_it] = cheapest[faces_it]
+        orientation %= 4
 
-    def _push(self, agent, push, ended):
-        """Push (or primitive forward) of one agent where `push`; marks what ended, returns the penalties, float [N]."""
-        step = FORWARD[self.orientation[:, agent]]  # [N, (x, y)]
-        front = self.position[:, agent] + step
-        at_wall = self._outside(front)
-        box = self._box_ahead(front)  # [N, 4]
-        blocked = box[:, 0] | box[:, 1] | box[:, 2] | box[:, 3]
-        pushes_small = push & (box[:, 0] | box[:, 1]) & (self.orientation[:, agent] == NORTH)
-        blocked &= ~pushes_small
-        walks = push & ~at_wall & ~blocked
-        self.position[:, agent] += step * walks[:, None]
-        self.box_y[:, :2] += box[:, :2] & pushes_small[:, None]
-        on_goal_row = self.position[:, agent, 1] == self.goal_y - 1  # of the pushed box, one cell ahead
-        at_border = self._outside(front + step)
-        ended[:, agent] |= push & (at_wall | blocked | np.where(pushes_small, on_goal_row, at_border))
-        return (push & (at_wall | blocked)).astype(float)
+        is_now_there = (position == waypoint).all(axis=1)
+        ends = goes & is_now_there & (orientation == NORTH)
+        self.last_waypoint[ends, agent] = action[ends]
+        return ends
 
-    def _go_to(self, action, ended):
-        """One step of Go-to for both agents: the cheapest neighbour cell by distance and turning."""
-        goes = action < PUSH
-        target = np.where(goes, action, 0)
-        waypoint = self.waypoints[target]  # [N, agents, (x, y)]
-        to_go = np.abs(waypoint - self.position)
-        was_there = (to_go[..., 0] < 0.1) & (to_go[..., 1] < 0.1)
-        cells = self.position[:, :, None] + FORWARD  # [N, agents, directions, (x, y)]
-        distance = np.abs(cells - waypoint[:, :, None])
-        cost = distance[..., 0] + distance[..., 1] + TURN_COST[self.orientation]  # [N, agents, directions]
-        # The published rule: every box cell counts as an obstacle in the row of small box 0.
-        in_row = cells[..., 1] == self.box_y[:, None, :1]
-        cost[in_row & self._box_column[cells[..., 0].astype(np.int64)]] = np.inf
-        best = cost.argmin(2)  # the first of equals
-        turn = (best - self.orientation) & 3
-        walks = goes & ~was_there & (turn == 0)
-        self.position += FORWARD[self.orientation] * walks[:, :, None]
-        turned = np.where(turn == 2, (self.orientation + 1) & 3, best)
-        turned = np.where(was_there, NORTH, turned)
-        self.orientation = np.where(goes, turned, self.orientation)
-        to_go = np.abs(waypoint - self.position)
-        arrived = goes & (to_go[..., 0] < 0.1) & (to_go[..., 1] < 0.1) & (self.orientation == NORTH)
-        ended |= arrived
-        self.last_waypoint = np.where(arrived, target, self.last_waypoint)
+    def _cheapest_direction(self, position, orientation, waypoint):
+        """The direction, int64 [N], of the neighbour cell with the lowest cost for Go-to, the first of equals."""
+        neighbour = position[:, None] + FORWARD  # [N, directions, (x, y)]
+        distance = np.abs(neighbour - waypoint[:, None]).sum(axis=2)
+        quarter_turns = (np.arange(4) - orientation[:, None]) % 4  # to the right
+        cost = distance + TURN_COST[quarter_turns]
+        in_box_row = neighbour[:, :, 1] == self.box_y[:, :1]  # the row of small box 0
+        in_box_column = np.isin(neighbour[:, :, 0], self.cell_x)
+        cost[in_box_row & in_box_column] = np.inf
+        return cost.argmin(axis=1)
 
+    def _push(self, agent, action):
+        """One step of Push in the environments where the agent runs it and is not locked onto the big box.
+
+        Returns:
+            ends bool [N], where Push ends, and penalised bool [N], where the agent gets a penalty.
+        """
+        position = self.position[:, agent]  # a view: writing to it moves the agent
+        orientation = self.orientation[:, agent]
+        small_y = self.box_y[:, SMALL]  # a view, too: writing to it moves a small box
+        pushes = (action == PUSH) & ~self.pushing_big
+        step = FORWARD[orientation]
+        front = position + step  # [N, (x, y)]
+        small_box_in_front = self._small_boxes_at(front)  # [N, small boxes]
+        any_small_box = small_box_in_front.any(axis=1)
+        any_box = any_small_box | self._big_box_at(front)
+
+        hits_boundary = pushes & self._is_outside(front)
+        pushes_small = pushes & any_small_box & (orientation == NORTH)
+        hits_box = pushes & any_box & ~pushes_small
+        penalised = hits_boundary | hits_box
+        walks = pushes & ~penalised  # alone, or behind the small box that it pushes
+        moved_boxes = small_box_in_front & pushes_small[:, None]
+        position[walks] += step[walks]
+        small_y[moved_boxes] += 1
+
+        box_arrives = (moved_boxes & (small_y >= self.goal_y)).any(axis=1)
+        reaches_boundary = walks & ~pushes_small & self._is_outside(front + step)
+        ends = penalised | box_arrives | reaches_boundary
+        return ends, penalised
+
+    def _turn_or_stay(self, agent, action):
+        """Turn-left, Turn-right and Stay; returns where the agent runs one of them, bool [N]."""
+        orientation = self.orientation[:, agent]  # a view: writing to it turns the agent
+        turns_left = action == TURN_LEFT
+        turns_right = action == TURN_RIGHT
+        stays = action == STAY
+        orientation[turns_left] -= 1
+        orientation[turns_right] += 1
+        orientation %= 4
+        return turns_left | turns_right | stays
+
+    def _push_big_box(self):
+        """The big box and both agents move one cell north where the agents are locked onto it."""
+        self.position[self.pushing_big, :, 1] += 1
+        self.box_y[self.pushing_big, BIG] += 1
+
+    # ---- what is in a cell; each environment has its own, float64 [N, (x, y)] -----------------------------------
+    def _small_boxes_at(self, cell):
+        """Which of the small boxes is in the cell, bool [N, 2]."""
+        same_x = self.box_x[SMALL] == cell[:, :1]
+        same_y = self.box_y[:, SMALL] == cell[:, 1:]
+        return same_x & same_y
+
+    def _big_box_at(self, cell):
+        """Whether one half of the big box is in the cell, bool [N]."""
+        same_x = np.abs(self.box_x[BIG] - cell[:, 0]) == 0.5
+        same_y = self.box_y[:, BIG] == cell[:, 1]
+        return same_x & same_y
+
+    def _is_outside(self, cell):
+        """Whether the cell is outside the grid, bool [N]."""
+        return ((cell < 0) | (cell > self.grid)).any(axis=1)
+
+    # ---- observations, the state and the picture ----------------------------------------------------------------
     def _observe(self, start):
         obs = np.zeros((self.num_envs, 2, 5), np.float32)
         if start:
-            obs[:, :, 2] = 1.0
+            obs[:] = (0, 0, 1, 0, 0)  # "nothing"
             return obs
-        front = self.position + FORWARD[self.orientation]  # [N, agents, (x, y)]
-        box = self._box_ahead(front)  # [N, agents, 4]
-        small, big, boundary = box[..., 0] | box[..., 1], box[..., 2] | box[..., 3], self._outside(front)
-        same = front == self.position[:, ::-1]
-        teammate = same[..., 0] & same[..., 1]
-        empty = ~(small | big | boundary | teammate)
-        for bit, value in enumerate((small, big, empty, boundary, teammate)):
-            obs[:, :, bit] = value
+        for agent in range(2):
+            front = self.position[:, agent] + FORWARD[self.orientation[:, agent]]
+            small_box = self._small_boxes_at(front).any(axis=1)
+            big_box = self._big_box_at(front)
+            boundary = self._is_outside(front)
+            teammate = (self.position[:, 1 - agent] == front).all(axis=1)
+            empty = ~(small_box | big_box | boundary | teammate)
+            obs[:, agent] = np.stack([small_box, big_box, empty, boundary, teammate], axis=1)
         return obs
 
     def _state(self):
-        state = np.zeros((self.num_envs, self.state_size), np.float32)
-        agents = state[:, :12].reshape(self.num_envs, 2, 6)  # [N, agents, (x, y, orientation)]
-        agents[..., :2] = self.position / self.grid
-        agents[..., 2:] = np.eye(4)[self.orientation]
-        state[:, 12:18:2] = self._boxes[:, 0] / self.grid
-        state[:, 13:18:2] = self.box_y / self.grid
-        waypoints = state[:, 18:26].reshape(self.num_envs, 2, 4)  # [N, agents, waypoints]
-        waypoints[:] = np.eye(5)[self.last_waypoint, :4]
-        state[:, 26] = self.pushing_big
-        return state
+        facing = self.orientation[:, :, None] == np.arange(4)  # [N, agents, orientations]
+        agents = np.concatenate([self.position / self.grid, facing], axis=2)
+        box_x = np.tile(self.box_x, (self.num_envs, 1))
+        boxes = np.stack([box_x, self.box_y], axis=2) / self.grid  # [N, boxes, (x, y)]
+        last_waypoint = self.last_waypoint[:, :, None] == np.arange(4)  # [N, agents, waypoints]
+        parts = [agents, boxes, last_waypoint, self.pushing_big]
+        flat = [part.reshape(self.num_envs, -1) for part in parts]
+        return np.concatenate(flat, axis=1, dtype=np.float32)
 
     def _draw(self, index):
         from envs.rendering import draw_box_pushing
 
         return draw_box_pushing(self, index)
+
+
+def _check_cells(name, value, cells, lowest, highest):
+    """Raises a ValueError unless cells, [..., (x, y)], are cell centres from lowest (x, y) to highest (x, y)."""
+    are_centres = (cells % 1 == 0.5).all()
+    are_inside = (cells >= lowest).all() and (cells <= highest).all()
+    if not (are_centres and are_inside):
+        raise ValueError(f"{name} must be cell centres from {lowest} to {highest}, got {checks.shown(value)}")

@@ -12,26 +12,31 @@ from gymnasium.vector.utils import batch_space
 class MacroVectorEnv(VectorEnv, ABC):
     """A batch of cooperative environments whose agents run macro-actions of different lengths.
 
-    One step is one primitive time step. An agent whose last macro-action has ended starts the one it is given; the
-    entry of an agent whose macro-action is still running is ignored. A macro-observation changes only in the step in
-    which its agent's macro-action ends. The end of an episode ends every macro-action, so the final observation is
-    everybody's. Environments are not reset by themselves (`AutoresetMode.DISABLED`): pass `options={"reset_mask":
-    terminated | truncated}`.
+    One step is one primitive time step. `step` takes a macro-action for every agent. An agent is free when its last
+    macro-action has ended: it starts the one that it is given. An agent is busy while its macro-action is running: it
+    goes on with it, and what it is given is ignored. A macro-observation changes only in the step in which its agent's
+    macro-action ends. The end of an episode ends all macro-actions, so every agent gets a macro-observation then.
+
+    Environments are not reset by themselves (`AutoresetMode.DISABLED`). After a step that ended episodes, call
+    `reset(options={"reset_mask": terminations | truncations})`.
 
     Attributes:
         num_envs: number of environments N.
         n_agents: number of agents n.
         n_actions: macro-actions of each agent, n ints.
-        obs_sizes: length of each agent's macro-observation, n ints; shorter ones are padded with 0 to the widest, d.
-        state_size: length S of the true state, the layout of which is in the domain's docstring.
+        obs_sizes: length of each agent's macro-observation, n ints. The largest is d. Shorter ones are padded with 0.
+        state_size: length S of the true state. The domain's docstring says what is in it.
         horizon: steps after which an episode is truncated.
         macro_action_names: for each agent the names of its macro-actions.
-        macro_done: bool [N, n], True where the agent is free, that is, will start what the next step gives it.
-        macro_action: int64 [N, n], the macro-action running or last run, -1 before the first.
-        own_actions: bool [n, A], which of the widest agent's A macro-actions each agent has.
+        macro_done: bool [N, n], whether the agent is free, so that it starts a macro-action in the next step.
+        macro_action: int64 [N, n], the macro-action that is running or ran last, -1 before the first.
+        own_actions: bool [n, A], which macro-actions each agent has. A is the largest of `n_actions`.
         available: bool [N, n, A], what each agent can do next. An agent that is free can start the macro-actions of its
             initiation set. An agent that is busy can only go on with the macro-action it runs.
-        elapsed: int64 [N], steps taken in the episode. episode_return: float64 [N], its undiscounted return so far.
+        elapsed: int64 [N], steps taken in the episode.
+        episode_return: float64 [N], the undiscounted return of the episode so far.
+        over: bool [N], whether the episode has ended. It is True before the first reset, too.
+        success: bool [N], whether the task's goal was reached in the last step.
 
     A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`. If its
     macro-actions have initiation sets, it overrides `_can_start`. It names the arrays that hold its simulator state in
@@ -42,9 +47,16 @@ class MacroVectorEnv(VectorEnv, ABC):
     sim_arrays: tuple[str, ...] = ()
 
     def __init__(self, num_envs, macro_action_names, obs_low, obs_high, obs_sizes, state_size, horizon, render_mode):
-        """Args:
-        num_envs: N >= 1. macro_action_names: a list of names for each agent. obs_low, obs_high: bounds [n, d].
-        obs_sizes: n ints <= d. state_size: S. horizon: >= 1 steps. render_mode: None or "rgb_array".
+        """Sets the attributes and the spaces.
+
+        Args:
+            num_envs: N, at least 1.
+            macro_action_names: a list of names for each agent.
+            obs_low, obs_high: bounds of the macro-observations, [n, d].
+            obs_sizes: n ints, at most d.
+            state_size: S.
+            horizon: at least 1 step.
+            render_mode: None or "rgb_array".
 
         Raises:
             ValueError: an argument is out of range.
@@ -55,49 +67,62 @@ class MacroVectorEnv(VectorEnv, ABC):
             raise ValueError(f"horizon must be at least 1 step, got {horizon}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
-        self.num_envs, self.horizon, self.render_mode = num_envs, horizon, render_mode
+        self.num_envs = num_envs
+        self.horizon = horizon
+        self.render_mode = render_mode
         self.macro_action_names = [list(names) for names in macro_action_names]
-        self.n_agents, self.n_actions = len(macro_action_names), [len(names) for names in macro_action_names]
-        self.obs_sizes, self.state_size = list(obs_sizes), state_size
-        self.single_observation_space = gym.spaces.Box(np.float32(obs_low), np.float32(obs_high), dtype=np.float32)
+        self.n_agents = len(macro_action_names)
+        self.n_actions = [len(names) for names in macro_action_names]
+        self.obs_sizes = list(obs_sizes)
+        self.state_size = state_size
+        low = np.float32(obs_low)
+        high = np.float32(obs_high)
+        self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.single_action_space = gym.spaces.MultiDiscrete(self.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.own_actions = np.arange(max(self.n_actions)) < np.array(self.n_actions)[:, None]
 
-        agents = (num_envs, self.n_agents)
-        self.macro_done, self.macro_action = np.ones(agents, bool), np.full(agents, -1)
-        self.elapsed, self.episode_return = np.zeros(num_envs, np.int64), np.zeros(num_envs)
-        self.over, self.success = np.ones(num_envs, bool), np.zeros(num_envs, bool)
+        self.macro_done = np.ones((num_envs, self.n_agents), bool)
+        self.macro_action = np.full((num_envs, self.n_agents), -1)
+        self.elapsed = np.zeros(num_envs, np.int64)
+        self.episode_return = np.zeros(num_envs)
+        self.over = np.ones(num_envs, bool)
+        self.success = np.zeros(num_envs, bool)
         self.available = np.tile(self.own_actions, (num_envs, 1, 1))
         self._obs = np.zeros((num_envs, *self.single_observation_space.shape), np.float32)
 
     # ---- what a domain implements -------------------------------------------------------------------------------
     @abstractmethod
     def _reset(self, mask):
-        """Puts the simulator arrays of the environments in mask, bool [N], to the start of an episode."""
+        """Sets the simulator arrays to the start of an episode in those environments where mask, bool [N], is True."""
 
     @abstractmethod
     def _advance(self):
-        """One step of `macro_action`, started in this step where `macro_done`. `elapsed` counts the step already.
+        """Takes one step of every agent's `macro_action`, the first one where `macro_done` is True.
+
+        `elapsed` already counts this step.
 
         Returns:
-            rewards float64 [N], terminations bool [N], ended bool [N, n] (macro-actions that end now), success bool
-            [N], in one step of an episode at most (evaluation adds it up).
+            rewards float64 [N]
+            terminations bool [N]
+            ended bool [N, n]: whether the agent's macro-action ends in this step
+            success bool [N]: whether the task's goal is reached in this step. It must be True in one step of an episode
+                at most, because evaluation adds it up.
         """
 
     @abstractmethod
     def _observe(self, start):
-        """Macro-observations float32 [N, n, d] of the current simulator state; start: those of a reset."""
+        """Macro-observations float32 [N, n, d] of the current simulator state; start: whether this is a reset."""
 
     @abstractmethod
     def _state(self):
         """The true state, a new float32 array [N, S]."""
 
     def _can_start(self):
-        """Initiation sets, bool [N, n, A]: what each agent could start now if it is free. By default all that it has.
+        """Initiation sets, bool [N, n, A]: which macro-actions each agent can start now if it is free.
 
-        Each free agent needs at least one macro-action that it can start.
+        By default these are all that it has. A free agent must have at least one that it can start.
         """
         return np.broadcast_to(self.own_actions, self.available.shape)
 
@@ -114,7 +139,7 @@ class MacroVectorEnv(VectorEnv, ABC):
             options: `{"reset_mask": bool [N]}` resets only those environments and leaves the others as they are.
 
         Returns:
-            obs float32 [N, n, d] and infos (as `step`, with `macro_action` -1 for an agent that has not chosen yet).
+            obs float32 [N, n, d] and infos: those of `step`. `macro_action` is -1 in the environments that were reset.
 
         Raises:
             ValueError: the mask has another shape or dtype.
@@ -123,13 +148,16 @@ class MacroVectorEnv(VectorEnv, ABC):
         mask = (options or {}).get("reset_mask")
         if mask is None:
             mask = np.ones(self.num_envs, bool)
-        elif np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool:
-            raise ValueError(f"options['reset_mask'] must be a bool array of shape ({self.num_envs},)")
         mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(f"options['reset_mask'] must be a bool array of shape ({self.num_envs},)")
         self._reset(mask)
-        self.macro_done[mask], self.macro_action[mask] = True, -1
-        self.elapsed[mask], self.episode_return[mask] = 0, 0.0
-        self.over[mask], self.success[mask] = False, False
+        self.macro_done[mask] = True
+        self.macro_action[mask] = -1
+        self.elapsed[mask] = 0
+        self.episode_return[mask] = 0.0
+        self.over[mask] = False
+        self.success[mask] = False
         self._obs[mask] = self._observe(start=True)[mask]
         self._update_available()
         return self._obs.copy(), self._infos()
@@ -141,10 +169,13 @@ class MacroVectorEnv(VectorEnv, ABC):
             actions: int [N, n], the macro-action of each free agent; other entries are ignored.
 
         Returns:
-            obs float32 [N, n, d], rewards float64 [N], terminations bool [N], truncations bool [N] and infos:
-            `macro_done` bool [N, n] (the agent's macro-action ended in this step: it chooses next), `macro_action`
-            int64 [N, n] (the one that ran), `available` bool [N, n, A] (what the agent can do next), `state` float32
-            [N, S], `success` bool [N] (the task's goal was reached).
+            obs float32 [N, n, d], rewards float64 [N], terminations bool [N], truncations bool [N] and infos, a dict:
+
+            - `macro_done` bool [N, n]: whether the agent's macro-action ended in this step, so that it chooses next
+            - `macro_action` int64 [N, n]: the macro-action that ran in this step
+            - `available` bool [N, n, A]: what the agent can do next
+            - `state` float32 [N, S]
+            - `success` bool [N]: whether the task's goal was reached in this step
 
         Raises:
             ValueError: the array has another shape or is not of integers, an environment's episode has ended, or a free
@@ -161,10 +192,11 @@ class MacroVectorEnv(VectorEnv, ABC):
                 "reset them first, with options={'reset_mask': terminations | truncations}"
             )
         self._check_free_agents(actions)
+        # "unsafe" lets actions be of any integer dtype. They are in range where they are copied.
         np.copyto(self.macro_action, actions, where=self.macro_done, casting="unsafe")
         self.elapsed += 1
         rewards, terminations, ended, success = self._advance()
-        self.success = success.copy()  # a later reset writes into it
+        self.success = success.copy()  # reset writes into it, and terminations may be the same array
         truncations = (self.elapsed >= self.horizon) & ~terminations
         self.over = terminations | truncations
         self.macro_done = ended | self.over[:, None]
@@ -182,27 +214,32 @@ class MacroVectorEnv(VectorEnv, ABC):
     def _check_free_agents(self, actions):
         """Raises ValueError for the first free agent that is given a macro-action which it cannot start."""
         in_range = (actions >= 0) & (actions < self.own_actions.shape[1])
-        known = np.where(in_range, actions, 0)
-        startable = in_range & np.take_along_axis(self.available, known[..., None], axis=2)[..., 0]
-        bad = self.macro_done & ~startable
-        if bad.any():
-            env, agent = np.argwhere(bad)[0]
-            given, count = actions[env, agent], self.n_actions[agent]
+        index = np.where(in_range, actions, 0)
+        is_available = np.take_along_axis(self.available, index[:, :, None], axis=2)[:, :, 0]  # [N, n]
+        bad = self.macro_done & ~(in_range & is_available)
+        if not bad.any():
+            return
+
+        env, agent = np.argwhere(bad)[0]
+        given = actions[env, agent]
+        count = self.n_actions[agent]
+        if 0 <= given < count:
+            name = self.macro_action_names[agent][given]
+            can_start = np.flatnonzero(self.available[env, agent]).tolist()
+            problem = f"{name} is not available, it can start {can_start}"
+        else:
             problem = f"it has 0..{count - 1}"
-            if 0 <= given < count:
-                can_start = np.flatnonzero(self.available[env, agent]).tolist()
-                problem = f"{self.macro_action_names[agent][given]} is not available, it can start {can_start}"
-            raise ValueError(f"agent {agent} of environment {env} was given macro-action {given}: {problem}")
+        raise ValueError(f"agent {agent} of environment {env} was given macro-action {given}: {problem}")
 
     def _update_available(self):
-        """Sets `available`: the initiation set of a free agent, only the running macro-action of a busy one."""
+        """Sets `available`: for a free agent its initiation set, for a busy one only its running macro-action."""
         can_start = self._can_start() & self.own_actions
         stuck = self.macro_done & ~can_start.any(axis=2)
         if stuck.any():
             env, agent = np.argwhere(stuck)[0]
             raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
-        running = self.macro_action[..., None] == np.arange(self.own_actions.shape[1])
-        self.available = np.where(self.macro_done[..., None], can_start, running)
+        is_running = self.macro_action[:, :, None] == np.arange(self.own_actions.shape[1])  # [N, n, A]
+        self.available = np.where(self.macro_done[:, :, None], can_start, is_running)
 
     def _infos(self):
         return {
@@ -215,20 +252,27 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     # ---- checkpoints --------------------------------------------------------------------------------------------
     def _checkpointed(self):
+        """The names of the arrays that make up a saved state."""
         base = ("macro_done", "macro_action", "elapsed", "episode_return", "over", "success", "_obs")
         return base + self.sim_arrays
 
     def save_state(self):
-        """The whole simulator, a dict of arrays. "np_random" is the generator's state, as the bytes of its JSON."""
+        """All that the simulator needs to go on, a dict of arrays.
+
+        Its entry "np_random" is the state of the random generator: JSON, as an array of bytes.
+        """
         arrays = {name: getattr(self, name).copy() for name in self._checkpointed()}
         generator = json.dumps(self.np_random.bit_generator.state)
         return arrays | {"np_random": np.frombuffer(generator.encode(), np.uint8).copy()}
 
     def load_state(self, saved):
-        """Continues from what `save_state` returned; returns obs and infos as the last reset or step did.
+        """Continues from what `save_state` returned.
+
+        Returns:
+            obs and infos, those of the last reset or step before it was saved.
 
         Raises:
-            ValueError: it was saved by another kind, size or number of environments.
+            ValueError: it was saved by another domain, or by one with other sizes or another number of environments.
         """
         for name in self._checkpointed():
             if name not in saved or np.shape(saved[name]) != getattr(self, name).shape:
@@ -241,20 +285,21 @@ class MacroVectorEnv(VectorEnv, ABC):
 
 
 class SingleMacroEnv(gym.Env):
-    """One environment of a domain as a `gymnasium.Env`: the batch of one without its first axis.
+    """One environment of a domain as a `gymnasium.Env`: a batch of one, without the batch's axis.
 
-    `obs` is float32 [n, d], the reward a float; infos are those of `MacroVectorEnv.step`.
+    `obs` is float32 [n, d] and the reward a float. The info has the entries of `MacroVectorEnv.step`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
 
     def __init__(self, vector_env):
-        self.vector_env, self.render_mode = vector_env, vector_env.render_mode
+        self.vector_env = vector_env
+        self.render_mode = vector_env.render_mode
         self.observation_space = vector_env.single_observation_space
         self.action_space = vector_env.single_action_space
 
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
+        super().reset(seed=seed)  # Gymnasium asks for it; vector_env has a generator of its own
         obs, infos = self.vector_env.reset(seed=seed)
         return obs[0], {key: value[0] for key, value in infos.items()}
 

@@ -8,10 +8,11 @@ from envs.core import MacroVectorEnv
 TOOLS = 3  # kinds of tools
 PHASES = 4  # of a human's work: tool k is needed for phase k + 1
 LAST_PHASE = PHASES - 1
-NO_TOOL = -1  # an empty place in the staging queue
+NO_TOOL = -1  # an empty place in the queue of staged tools
 
 # Positions are in metres. There is one entry per human in `workshops` and `phase_lengths`, and one per robot in
-# `tables` and `starts`. `arm` is only drawn.
+# `tables` (its place at the arm's table) and `starts`. `copies` is the number of copies of each tool. `arm` is only
+# drawn.
 LAYOUTS = {
     "s": {
         "workshops": [(6.0, 3.0)],
@@ -71,79 +72,99 @@ class Warehouse(MacroVectorEnv):
     the workshops. The team should bring every tool before its human has to wait for it.
 
     There are four layouts (`LAYOUTS`): "s" has 2 robots and 1 human, "d" 2 and 2, "t" 2 and 3, "t1" 3 and 3.
-    Agents are ordered robots first, arm last. Everything is deterministic.
+    The agents are the robots, in their order, and then the arm. Everything is deterministic. Each step, in this order:
+
+    1. Every robot moves. A robot that is on Get-Tool and at the table waits.
+    2. Robots that reach a workshop in this step deliver, robot 0 first.
+    3. The arm works. If its macro-action ends, it stages the tool that it has found or hands a tool over.
+    4. The episode terminates if every human has all its tools (see "Episode end").
+    5. Every human works: its clock counts down. If the clock has run down and the human has its next tool, its next
+       phase begins.
 
     ## Macro-actions
     A robot has H + 2 macro-actions:
 
-    - 0..H-1: Go-W(i). The robot goes to workshop i. There it gives human i its next tool if it carries that tool.
+    - 0..H-1: Go-W(i). The robot goes to workshop i. On its arrival it gives human i the tool for the human's next
+      phase, if the robot carries that tool and the human does not have it yet.
     - H: Go-TR. The robot goes to the tool room.
     - H+1: Get-Tool. The robot goes to its own place at the table and waits there for a tool, for 10 steps at most.
 
-    A robot moves `robot_speed` a step, straight to the waypoint of its macro-action, and stands exactly on it at the
-    end. Get-Tool waits from the step after the robot's arrival on. Where the way takes a single step, that step already
-    counts as waiting.
+    A robot moves `robot_speed` a step, straight to the waypoint of its macro-action. The last step is shorter, so that
+    the robot ends exactly on the waypoint. The first step of waiting is the one after the robot's arrival. If the robot
+    was not under way in the step before its arrival (its way took a single step, or none), the step of its arrival
+    already counts as waiting.
 
     The arm has 1 + R + 3 macro-actions:
 
     - 0: Wait-M takes 1 step and does nothing.
-    - 1..R: Pass-to-M(j) takes 4 steps. At its end robot j gets the oldest staged tool, and its Get-Tool ends. (The
-      Get-Tool ends also when nothing is staged.) The Pass fails if robot j is not waiting at the table when the Pass
-      begins or when it ends.
-    - R+1..R+3: Search-Tool(k) takes 6 steps. At its end a copy of tool k is staged if a copy is left to be found and
-      there is room for it.
+    - 1..R: Pass-to-M(j) takes 4 steps. At its end robot j gets the oldest staged tool, and the robot's Get-Tool ends.
+      If nothing is staged, the Get-Tool ends all the same. The Pass fails if robot j is not waiting at the table when
+      the Pass begins or when it ends. A Pass that fails takes its 4 steps, too, and is penalised at their end.
+    - R+1..R+3: Search-Tool(k) takes 6 steps. At its end a copy of tool k is staged if not all of its copies have been
+      found and there is room for one more tool.
 
-    With `primitive=True` every macro-action ends after one step and has its effect in this step. A robot moves one step
-    (or waits one step, or delivers) and is asked again. Search finds its tool in one step and Pass hands it over in one
-    step.
+    With `primitive=True` every macro-action lasts one step. A robot moves for one step, or waits for one step, and
+    chooses again; it delivers in the step in which it arrives. Search finds its tool in one step and Pass hands a tool
+    over in one step.
 
     ## Macro-observations
-    A robot observes H + 3 + 4H + 3 + C numbers (C is the staging capacity, 2):
+    A robot observes H + 3 + 4H + 3 + C numbers (C is `staging_capacity`, 2 by default):
 
-    - where it is, one-hot: workshop 0..H-1, tool room, table, "nowhere yet" (before it reached a first waypoint)
-    - for each human its phase, one-hot, shown only while the robot is at that human's workshop
-    - how many of each of the three tools it carries
-    - the number of staged tools, one-hot over 1..C, shown only in the tool room, at the table and "nowhere yet"
+    - H + 3: the place that it has reached last, one-hot: workshop 0..H-1, tool room, table, or "nowhere yet" (before it
+      has reached any)
+    - 4H: for each human its phase, one-hot, or zeros if the robot's place is not that human's workshop
+    - 3: how many of each tool it carries
+    - C: the number of staged tools, one-hot over 1..C, or zeros if there is none or the robot's place is a workshop
 
     The arm observes 3 + R numbers:
 
-    - how many of each of the three tools are staged
-    - for each robot whether it stands at its table place
+    - 3: how many of each tool are staged
+    - R: for each robot whether it stands at its place at the table
 
-    At a reset a robot observes only "nowhere yet", and the arm observes zeros.
+    At a reset a robot's place is "nowhere yet" and all else is 0. The arm observes only zeros.
 
     ## Rewards
     - -1 each step
-    - +100 for each tool delivered, or +80 if its human's phase clock has already run down
+    - +100 for each tool delivered, or +80 if the clock of the human's phase has already run down
     - -10 for a failed Pass
 
     ## Episode end
-    - Termination: every human has got the tool for its fourth phase. A human that got it early may already have begun
-      that phase, or finished it. Termination is also `success`.
+    - Termination: every human has got the tool for its fourth phase. It does not matter whether a human has already
+      begun or finished that phase. Termination is also `success`.
     - Truncation: after `horizon` steps.
 
     ## State
-    For each robot r, from 5r: x / room width, y / room depth (2), tools carried (3). Then the arm, from a = 5R:
+    For each robot five numbers:
 
-    - a..a+2 staged tools, counts (a tool being passed stays among them until the Pass ends)
-    - a+3..a+5 the tool in its hand during a Pass that has not failed at its beginning, one-hot
-    - a+6..a+8 tools found so far, counts
-    - a+9 steps left of its macro-action / those of its longest one
-    - a+10..a+13+R its running macro-action, one-hot, zeros when none is running
+    - (2) x / room width, y / room depth
+    - (3) how many of each tool it carries
 
-    For each human h, from a + 14 + R + 6h: phase, one-hot (4); clock / phase length, clipped to [-1, 1]; whether it has
-    its next tool (always so in the fourth phase).
+    Then for the arm 14 + R numbers:
+
+    - (3) how many of each tool are staged; a tool that is being passed counts until the Pass ends
+    - (3) the tool in its hand, one-hot: the oldest staged one while a Pass is running whose robot was waiting when it
+      began, zeros otherwise
+    - (3) how many of each tool have been found so far
+    - (1) steps left of its macro-action / length of its longest macro-action
+    - (4 + R) its running macro-action, one-hot, zeros when none is running
+
+    Then for each human six numbers:
+
+    - (4) its phase, one-hot
+    - (1) its clock / length of the phase, at least -1
+    - (1) whether it has the tool for its next phase; always 1 in the fourth phase
 
     ## Arguments
-    - layout: a key of `LAYOUTS`. Each of its entries can be replaced by the keyword of the same name, and all of them
-      together are a new layout: `workshops` [H, 2], `tool_room` [2], `tables` [R, 2], `starts` [R, 2], `arm` [2] (only
-      drawn), `robot_speed` (metres per step), `copies` (of each tool, one number or three), `phase_lengths` [H, 4]
-      (steps)
-    - primitive: every macro-action takes one step
+    - layout: a key of `LAYOUTS`. Each of its entries can be replaced by the keyword of the same name: `workshops`
+      [H, 2], `tool_room` [2], `tables` [R, 2], `starts` [R, 2], `arm` [2] (only drawn), `robot_speed` (metres per
+      step), `copies` (of each tool, one number for all or three), `phase_lengths` [H, 4] (steps). With all of them you
+      have a layout of your own.
+    - primitive: whether every macro-action takes one step
     - horizon: steps until truncation
     - render_mode: None or "rgb_array"
-    - delivery_reward, late_penalty (what a late delivery loses of it), failed_pass_penalty, step_cost: given as
-      positive numbers
+    - delivery_reward: for a tool that is delivered in time
+    - late_penalty, failed_pass_penalty, step_cost: positive numbers that are subtracted. A late delivery earns
+      `delivery_reward - late_penalty`.
     - search_steps, pass_steps, arm_wait_steps: how long the arm's macro-actions take, 6, 4 and 1 by default. With
       `primitive=True` they are 1, and any other number is an error.
     - tool_wait_steps: how long Get-Tool waits at the table
@@ -155,30 +176,33 @@ class Warehouse(MacroVectorEnv):
 
     - the arguments, lists as arrays; n_humans H and n_robots R
     - the numbers of places: 0..H-1 workshops, tool_room_place H, table_place H+1, nowhere_yet H+2. A robot's
-      macro-action has the number of the place to which it goes.
-    - waypoints float64 [R, H + 2, 2], where these places are, for each robot
+      macro-action has the number of the place to which it leads.
+    - waypoints float64 [R, H + 2, (x, y)], where each robot finds these places (all but "nowhere yet")
     - task_steps int [1 + R + 3], how long each of the arm's macro-actions takes
 
     The simulator's state is in these arrays:
 
-    - position float64 [N, R, 2]
-    - location int [N, R], the last place reached
-    - under_way bool [N, R], whether the robot moved in the last step without reaching its waypoint
-    - waited int [N, R], steps of waiting at the table. The count is 0 again when a Pass serves the robot or when the
-      robot is under way. The last step of a wait in vain counts as the first step of the next wait.
+    - position float64 [N, R, (x, y)]
+    - location int [N, R], the number of the place that the robot has reached last
+    - under_way bool [N, R], whether the robot did not reach its waypoint in the last step
+    - waited int [N, R], for how many steps the robot has waited at the table. The count is set to 0 when a Pass serves
+      the robot and in each step in which the robot is under way. It is set to 1 when a Get-Tool has waited in vain and
+      ends: if the robot chooses Get-Tool again, that step counts as the first one of the new wait.
     - carried int [N, R, 3], copies of each tool
     - staged int [N, C], queue of tools, oldest first, -1 for an empty place
-    - found int [N, 3], copies found so far
+    - found int [N, 3], copies of each tool found so far
     - arm_left int [N], steps left of the arm's macro-action
-    - pass_ready bool [N], whether the arm runs, or last ran, a Pass whose robot was waiting when it began
+    - pass_ready bool [N], about the macro-action that the arm runs or ran last: whether it is a Pass whose robot was
+      waiting when it began
     - phase int [N, H], 0..3
-    - clock int [N, H], steps left of the phase, <= 0 while the human waits for its tool or, in the fourth phase, has
-      finished
-    - has_next_tool bool [N, H], whether the human has the tool for its next phase (always so in the fourth)
+    - clock int [N, H], steps left of the phase. It is 0 or less while the human waits for its tool and when it has
+      finished the fourth phase.
+    - has_next_tool bool [N, H], whether the human has the tool for its next phase (always True in the fourth phase)
 
     ## Irregularities of the published code that are not kept
-    The paper states one rule for all rooms. In the published single room Get-Tool waits 11 steps and a delivery counts
-    as late one step later. In the published four-agent room the arm does not check robot 2 at the start of a Pass.
+    The paper on asynchronous value factorization (see Source) states one rule for all layouts. In the published code
+    for "s" Get-Tool waits 11 steps and a delivery counts as late one step later. In the published code for "t1" the arm
+    does not check robot 2 at the start of a Pass.
 
     ## Source
     Y. Xiao, J. Hoffman, T. Xia, C. Amato, "Learning Multi-Robot Decentralized Macro-Action-Based Policies via a
@@ -230,7 +254,7 @@ class Warehouse(MacroVectorEnv):
         staging_capacity=2,
     ):
         """Raises ValueError: the layout is unknown, or an argument is out of range or does not fit the others."""
-        if layout not in list(LAYOUTS):
+        if layout not in list(LAYOUTS):  # a list, because the argument may have no hash
             raise ValueError(f"unknown layout {layout!r}; valid layouts: {' '.join(LAYOUTS)}")
 
         self.layout = layout
@@ -241,7 +265,7 @@ class Warehouse(MacroVectorEnv):
             return LAYOUTS[layout][name] if value is None else value
 
         def duration(name, value, usual):
-            """Steps that a macro-action of the arm takes."""
+            """How many steps a macro-action of the arm takes: the keyword's value, else 1 if primitive, else usual."""
             if value is None:
                 return 1 if self.primitive else usual
             steps = checks.whole(name, value)
@@ -258,7 +282,7 @@ class Warehouse(MacroVectorEnv):
         copies = given("copies", copies)
         self.copies = checks.whole("copies", copies if np.iterable(copies) else [copies] * TOOLS, (TOOLS,))
         lengths = given("phase_lengths", phase_lengths)
-        shape = checks.rows("phase_lengths", lengths, PHASES).shape
+        shape = checks.rows("phase_lengths", lengths, PHASES).shape  # [H, 4]
         self.phase_lengths = checks.whole("phase_lengths", lengths, shape)
         self.room_size = checks.positive("room_size", room_size, (2,))
         self.delivery_reward = checks.numbers("delivery_reward", delivery_reward)
@@ -282,12 +306,13 @@ class Warehouse(MacroVectorEnv):
         self.n_humans = humans
         self.n_robots = robots
 
-        # The robots' waypoints and macro-actions have the same numbers.
+        # The numbers of the places, which are also those of the robots' macro-actions.
         self.tool_room_place = humans
         self.table_place = humans + 1
         self.nowhere_yet = humans + 2
-        shared_waypoints = np.vstack([self.workshops, self.tool_room])
-        self.waypoints = np.stack([np.vstack([shared_waypoints, table]) for table in self.tables])
+        shared_waypoints = np.vstack([self.workshops, self.tool_room])  # [H + 1, (x, y)]
+        waypoints = [np.vstack([shared_waypoints, table]) for table in self.tables]
+        self.waypoints = np.stack(waypoints)  # [R, H + 2, (x, y)]
         go_names = [f"Go-W({human})" for human in range(humans)]
         robot_names = [*go_names, "Go-TR", "Get-Tool"]
 
@@ -330,7 +355,7 @@ class Warehouse(MacroVectorEnv):
         self.phase = np.zeros((self.num_envs, humans), np.int64)
         self.clock = np.zeros((self.num_envs, humans), np.int64)
         self.has_next_tool = np.zeros((self.num_envs, humans), bool)
-        self._reset(np.ones(self.num_envs, bool))
+        self._reset(np.ones(self.num_envs, bool))  # valid arrays even before the first reset
 
     def _reset(self, mask):
         self.position[mask] = self.starts
@@ -346,65 +371,69 @@ class Warehouse(MacroVectorEnv):
         self.clock[mask] = self.phase_lengths[:, 0]
         self.has_next_tool[mask] = False
 
-    # ---- the rules of one step ----------------------------------------------------------------------------------
+    # ---- the rules, in the order of a step ----------------------------------------------------------------------
     def _advance(self):
-        moves = self.macro_action[:, :-1]  # [N, R]
-        task = self.macro_action[:, -1]  # [N]
-        gets_tool = moves == self.table_place
+        destination = self.macro_action[:, :-1]  # [N, R], the place to which each robot goes
+        arm_action = self.macro_action[:, -1]  # [N]
+        gets_tool = destination == self.table_place
 
-        arrived = self._move_robots(moves)
-        gives_up = self._wait_at_table(arrived & gets_tool, ~arrived)
-        rewards = self._deliver(arrived, moves) - self.step_cost
+        arrived = self._move_robots(destination)
+        gives_up = self._wait_at_table(at_table=arrived & gets_tool, under_way=~arrived)
+        rewards = self._deliver(arrived, destination) - self.step_cost
 
-        task_ends = self._run_arm(task)
-        self._stage_found_tool(task, task_ends)
-        served, pass_fails = self._hand_over(task, task_ends, gets_tool)
+        arm_ends = self._run_arm(arm_action)
+        self._stage_found_tool(arm_action, arm_ends)
+        served, pass_fails = self._hand_over(arm_action, arm_ends, gets_tool)
         rewards -= np.where(pass_fails, self.failed_pass_penalty, 0.0)
 
-        move_ends = (arrived & ~gets_tool) | gives_up | served
-        ended = np.column_stack([move_ends, task_ends])
+        robot_ends = (arrived & ~gets_tool) | gives_up | served
+        ended = np.column_stack([robot_ends, arm_ends])
         if self.primitive:
             ended[:] = True
 
-        has_last_tool = (self.phase >= LAST_PHASE - 1) & self.has_next_tool
+        has_last_tool = (self.phase >= LAST_PHASE - 1) & self.has_next_tool  # [N, H]
         all_supplied = has_last_tool.all(axis=1)
         self._advance_humans()
         return rewards, all_supplied, ended, all_supplied
 
-    def _move_robots(self, moves):
-        """Moves each robot one step towards its waypoint and returns which stand on it now, bool [N, R]."""
-        target = self.waypoints[np.arange(self.n_robots), moves]
-        to_target = target - self.position
-        distance = np.round(np.linalg.norm(to_target, axis=2), 2)  # to the centimetre, as in the published benchmark
+    def _move_robots(self, destination):
+        """Moves each robot one step towards its waypoint and returns whether it stands on it now, bool [N, R]."""
+        waypoint = self.waypoints[np.arange(self.n_robots), destination]  # [N, R, (x, y)]
+        way = waypoint - self.position
+        distance = np.round(np.linalg.norm(way, axis=2), 2)  # to the centimetre, as in the published benchmark
         arrived = distance <= self.robot_speed
-        share = self.robot_speed / np.maximum(distance, self.robot_speed)  # of the way that is left
-        moved = self.position + share[..., None] * to_target
-        self.position = np.where(arrived[..., None], target, moved)
-        self.location = np.where(arrived, moves, self.location)
+        share = self.robot_speed / np.maximum(distance, self.robot_speed)  # the part of the way to go now
+        moved = self.position + share[:, :, None] * way
+        self.position = np.where(arrived[:, :, None], waypoint, moved)
+        self.location = np.where(arrived, destination, self.location)
         return arrived
 
     def _wait_at_table(self, at_table, under_way):
-        """Counts the steps of waiting of the robots that are on Get-Tool and at the table.
+        """Counts the steps that robots wait at the table.
+
+        Args:
+            at_table: bool [N, R], whether the robot is on Get-Tool and at the table.
+            under_way: bool [N, R], whether the robot has not reached its waypoint.
 
         Returns:
-            gives_up bool [N, R], the robots that have waited in vain for long enough.
+            gives_up bool [N, R], whether the robot's Get-Tool ends because it has waited in vain for long enough.
         """
-        has_just_come = self.under_way
-        waits = at_table & ~has_just_come
+        was_under_way = self.under_way  # in the step before
+        waits = at_table & ~was_under_way
         self.waited[waits] += 1
         self.waited[under_way] = 0
         self.under_way = under_way
         gives_up = waits & (self.waited >= self.tool_wait_steps)
-        self.waited[gives_up] = 1  # this step is the first of the next wait
+        self.waited[gives_up] = 1  # this step counts as the first one of a new wait
         return gives_up
 
-    def _deliver(self, arrived, moves):
-        """Lets robots at a workshop give its human the next tool and returns the rewards, float64 [N]."""
-        visits = arrived[..., None] & one_hot(moves, self.n_humans)  # [N, R, H]
-        needed = np.minimum(self.phase, TOOLS - 1)  # [N, H]; in the last phase nothing is needed
+    def _deliver(self, arrived, destination):
+        """Robots that have reached a workshop give its human the next tool; returns the rewards, float64 [N]."""
+        visits = arrived[:, :, None] & one_hot(destination, self.n_humans)  # [N, R, H]
+        needed = np.minimum(self.phase, TOOLS - 1)  # [N, H]; not used in the last phase
         receives = np.zeros_like(self.has_next_tool)
         for robot in range(self.n_robots):  # one after the other: two may bring a human the same tool
-            carries = np.take_along_axis(self.carried[:, robot], needed, axis=1) > 0
+            carries = np.take_along_axis(self.carried[:, robot], needed, axis=1) > 0  # [N, H]
             delivers = visits[:, robot] & carries & ~self.has_next_tool
             env, human = np.nonzero(delivers)
             self.carried[env, robot, needed[env, human]] -= 1
@@ -414,32 +443,32 @@ class Warehouse(MacroVectorEnv):
         value = np.where(late, self.delivery_reward - self.late_penalty, self.delivery_reward)
         return np.where(receives, value, 0.0).sum(axis=1)
 
-    def _run_arm(self, task):
-        """Runs the arm's macro-action for a step, the first one if it was free; returns where it ends, bool [N]."""
+    def _run_arm(self, arm_action):
+        """Takes one step of the arm's macro-action; returns where it ends, bool [N]."""
         starts = self.macro_done[:, -1]
-        is_waiting = (self.location == self.table_place) & (self.waited >= 1)
-        can_pass = (self._receiver(task) & is_waiting).any(axis=1)
+        is_waiting = (self.location == self.table_place) & (self.waited >= 1)  # [N, R]
+        can_pass = (self._receiver(arm_action) & is_waiting).any(axis=1)
         self.pass_ready = np.where(starts, can_pass, self.pass_ready)
-        self.arm_left = np.where(starts, self.task_steps[task], self.arm_left) - 1
+        self.arm_left = np.where(starts, self.task_steps[arm_action], self.arm_left) - 1
         return self.arm_left == 0
 
-    def _stage_found_tool(self, task, task_ends):
-        """Ends Search: a copy of the tool, if one is left, goes to the end of the queue, if there is room."""
+    def _stage_found_tool(self, arm_action, arm_ends):
+        """Where a Search ends: puts a copy of the tool, if one is left, at the end of the queue, if there is room."""
         n_staged = self._n_staged()
         has_room = n_staged < self.staging_capacity
-        search_ends = self._sought(task) & task_ends[:, None]  # [N, TOOLS]
+        search_ends = self._sought(arm_action) & arm_ends[:, None]  # [N, TOOLS]
         finds = search_ends & has_room[:, None] & (self.found < self.copies)
         env, tool = np.nonzero(finds)
         self.found[env, tool] += 1
         self.staged[env, n_staged[env]] = tool
 
-    def _hand_over(self, task, task_ends, gets_tool):
-        """Ends Pass: the oldest staged tool, if there is one, goes to the robot, and the queue moves up.
+    def _hand_over(self, arm_action, arm_ends, gets_tool):
+        """Where a Pass ends: gives the oldest staged tool, if there is one, to the robot, and the queue moves up.
 
         Returns:
-            served bool [N, R], the robots whose Get-Tool ends by it, and fails bool [N], where the Pass has failed.
+            served bool [N, R], whether the Pass ends the robot's Get-Tool, and fails bool [N], whether the Pass fails.
         """
-        pass_ends = self._receiver(task) & task_ends[:, None]  # [N, R]
+        pass_ends = self._receiver(arm_action) & arm_ends[:, None]  # [N, R]
         served = pass_ends & self.pass_ready[:, None] & gets_tool & (self.waited >= 1)
         fails = (pass_ends & ~served).any(axis=1)
         self.waited[served] = 0
@@ -460,22 +489,23 @@ class Warehouse(MacroVectorEnv):
         begins = ~in_last_phase & (self.clock <= 0) & self.has_next_tool
         self.phase[begins] += 1
         self.clock[begins] = self._phase_length()[begins]
-        self.has_next_tool[begins] = self.phase[begins] == LAST_PHASE  # which needs no further tool
+        self.has_next_tool[begins] = self.phase[begins] == LAST_PHASE  # it needs no other tool
 
-    def _receiver(self, task):
+    # ---- small helpers ------------------------------------------------------------------------------------------
+    def _receiver(self, arm_action):
         """The robot to which a Pass goes, one-hot [N, R]; all False for the arm's other macro-actions."""
-        return one_hot(task - 1, self.n_robots)
+        return one_hot(arm_action - 1, self.n_robots)
 
-    def _sought(self, task):
+    def _sought(self, arm_action):
         """The tool for which a Search looks, one-hot [N, TOOLS]; all False for the arm's other macro-actions."""
-        return one_hot(task - 1 - self.n_robots, TOOLS)
+        return one_hot(arm_action - 1 - self.n_robots, TOOLS)
 
     def _n_staged(self):
         """How many tools are staged, int [N]."""
         return (self.staged != NO_TOOL).sum(axis=1)
 
     def _phase_length(self):
-        """How many steps each human's phase takes, int [N, H]."""
+        """How many steps each human's present phase takes, int [N, H]."""
         return self.phase_lengths[np.arange(self.n_humans), self.phase]
 
     # ---- observations and the state, in the order of the class docstring ----------------------------------------
@@ -486,19 +516,19 @@ class Warehouse(MacroVectorEnv):
         obs[:, :-1, : robots.shape[2]] = robots
         obs[:, -1, : arm.shape[1]] = arm
         if start:
-            obs[:, -1] = 0.0  # the arm does not see yet who stands at the table
+            obs[:, -1] = 0.0  # the arm does not see who stands at the table at a reset
         return obs
 
     def _observe_robots(self):
         place = one_hot(self.location, self.nowhere_yet + 1)
         at_workshop = place[:, :, : self.n_humans]
         phase = one_hot(self.phase, PHASES)
-        phase_here = at_workshop[..., None] & phase[:, None]  # [N, R, H, PHASES]
+        phase_here = at_workshop[:, :, :, None] & phase[:, None]  # [N, R, H, PHASES]
         phases_seen = phase_here.reshape(self.num_envs, self.n_robots, -1)
 
-        sees_queue = self.location >= self.tool_room_place  # in the tool room, at the table or nowhere yet
-        n_staged = one_hot(self._n_staged() - 1, self.staging_capacity)
-        n_staged_seen = sees_queue[..., None] & n_staged[:, None]
+        sees_queue = self.location >= self.tool_room_place  # not at a workshop
+        n_staged = one_hot(self._n_staged() - 1, self.staging_capacity)  # [N, C]
+        n_staged_seen = sees_queue[:, :, None] & n_staged[:, None]
         return np.concatenate([place, phases_seen, self.carried, n_staged_seen], axis=2)
 
     def _observe_arm(self):
@@ -513,10 +543,11 @@ class Warehouse(MacroVectorEnv):
         robots = np.concatenate([self.position / self.room_size, self.carried], axis=2)
 
         is_running = self.arm_left > 0
-        in_hand = one_hot(self.staged[:, 0], TOOLS) & (is_running & self.pass_ready)[:, None]
+        is_passing = is_running & self.pass_ready
+        in_hand = one_hot(self.staged[:, 0], TOOLS) & is_passing[:, None]
         share_left = self.arm_left / self.task_steps.max()
-        task = one_hot(self.macro_action[:, -1], len(self.task_steps)) & is_running[:, None]
-        arm = [self._staged_counts(), in_hand, self.found, share_left[:, None], task]
+        arm_action = one_hot(self.macro_action[:, -1], len(self.task_steps)) & is_running[:, None]
+        arm = [self._staged_counts(), in_hand, self.found, share_left[:, None], arm_action]
 
         phase = one_hot(self.phase, PHASES)
         clock = np.maximum(self.clock / self._phase_length(), -1.0)
@@ -526,6 +557,6 @@ class Warehouse(MacroVectorEnv):
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def _draw(self, index):
-        from envs.rendering import draw_warehouse  # only needed, and only imports pillow, for pictures
+        from envs.rendering import draw_warehouse
 
         return draw_warehouse(self, index)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import envs
+from envs import checks
 from tests.matrix_game import MatrixGame
 
 every_task = pytest.mark.parametrize("env_id", envs.IDS)
@@ -68,7 +69,7 @@ def test_step_contract(env_id, seed, num_envs, stay_away):
         assert infos["macro_done"][over].all(), "the end of an episode ends every macro-action"
         ongoing = ~infos["macro_done"]
         np.testing.assert_array_equal(obs[ongoing], before[ongoing])
-        if "primitive" in env_id:
+        if env_id.endswith(("-primitive", "-onestep")):
             assert infos["macro_done"].all()
         for agent, size in enumerate(env.obs_sizes):
             assert not obs[:, agent, size:].any(), "padding is 0"
@@ -208,12 +209,12 @@ def test_bad_input_says_what_is_wrong():
     with pytest.raises(ValueError, match=r"unknown environment 'wtd'.*valid ids: bp-10"):
         envs.make("wtd")
     for arguments, message in (
-        (dict(num_envs=0), "num_envs must be at least 1"),
-        (dict(horizon=0), "horizon must be at least 1"),
+        (dict(num_envs=0), "num_envs must be a finite number of at least 1, got 0"),
+        (dict(horizon=0), "horizon must be a finite number of at least 1, got 0"),
         (dict(render_mode="human"), "render_mode must be None or one of"),
-        (dict(grid=7), "grid must be an even number"),
-        (dict(small_boxes=[(1.5, 9.5), (8.5, 5.5)]), "below the goal row"),
-        (dict(agent_starts=[(1.0, 1.5), (8.5, 1.5)]), "cell centres inside the grid"),
+        (dict(grid=7), "grid must be even, got 7"),
+        (dict(small_boxes=[(1.5, 9.5), (8.5, 5.5)]), r"small_boxes must be cell centres .* to \(9.5, 8.5\), got"),
+        (dict(agent_starts=[(1.0, 1.5), (8.5, 1.5)]), r"agent_starts must be cell centres .* to \(9.5, 9.5\), got"),
     ):
         with pytest.raises(ValueError, match=message):
             envs.make("bp-10", **arguments)
@@ -236,6 +237,95 @@ def test_bad_input_says_what_is_wrong():
     assert truncations.all() and not terminations.any()
     with pytest.raises(ValueError, match="have ended"):
         env.step(np.full((2, 2), 7))
+
+
+NAN = float("nan")
+BAD_KEYWORDS = {
+    "bp-10": {
+        "num_envs": [0, 2.5, NAN, "2", [2], None],
+        "grid": [4, 7, 10.5, NAN, "10", True, None],
+        "primitive": ["False", 1, None],
+        "horizon": [0, 7.5, NAN, float("inf")],
+        "render_mode": ["human"],
+        "penalty": [NAN, float("-inf"), "-10", [-10.0], True, None],
+        "step_cost": [NAN, np.array([-0.1, -0.1])],
+        "small_reward": [NAN, 1j],
+        "big_reward": [NAN, {}],
+        "agent_starts": [
+            *[5, [], "there", [(1.5, 1.5)], [(1.5,), (8.5, 1.5)], [(1.0, 1.5), (8.5, 1.5)], np.full((2, 2), NAN)],
+            *[[(1.5, 1.5), (10.5, 1.5)], [(1.5, 1.5), (8.5, -0.5)], np.full((2, 3), 1.5)],
+        ],
+        "agent_orientations": [1, (0,), (0, 4), (-1, 0), (0.5, 1), (NAN, 0), "NE", np.array([1, 4])],
+        "small_boxes": [
+            *[5.5, [(1.5, 5.5)], [(1.5, 5.5), (8.5, None)], [(1.5, 5.5), (8.5, 0.5)], [(1.5, 9.5), (8.5, 5.5)]],
+            *[[(1.5, 5.5), (8.5, 5.0)], np.full((3, 2), 5.5)],
+        ],
+        "big_box": [5, (5,), [(5, 5.5)], (5.5, 5.5), (5, 5), (0, 5.5), (10, 5.5), (5, 0.5), (5, 9.5), (NAN, 5.5)],
+    },
+    "ct-10": {
+        "num_envs": [0, 2.5, NAN, "2"],
+        "n_agents": [0, 2.5, NAN, "ten", [10], True],
+        "grid": [1, 9.5, NAN, (10, 10)],
+        "primitive": ["yes", 0],
+        "one_step": [1, None],
+        "slip": [-0.1, 1.5, NAN, None],
+        "flicker": [-0.1, 1.1, NAN, "0.3"],
+        "capture_reward": [NAN, float("inf"), [1.0]],
+        "horizon": [0, 60.5, NAN],
+        "render_mode": ["human"],
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name", "value"),
+    [
+        (env_id, name, value)
+        for env_id, keywords in BAD_KEYWORDS.items()
+        for name, values in keywords.items()
+        for value in values
+    ],
+)
+def test_a_bad_keyword_gets_one_line_with_its_name_and_value(env_id, name, value):
+    with pytest.raises(ValueError) as error:
+        envs.make(env_id, **{name: value})
+    message = str(error.value)
+    assert f"{name} must be" in message and message.endswith(f", got {checks.shown(value)}") and "\n" not in message
+
+
+def test_a_keyword_may_be_an_array_or_a_number_of_another_type():
+    given = {
+        "grid": np.int32(12),
+        "horizon": 40.0,
+        "penalty": np.float32(-3.0),
+        "agent_starts": [(2.5, 2.5), (9.5, 3.5)],
+        "agent_orientations": [0, 2],
+        "small_boxes": [(2.5, 6.5), (9.5, 5.5)],
+        "big_box": (6, 7.5),
+    }
+    arrays = {name: np.array(value) for name, value in given.items()}
+    assert_same(play(envs.make("bp-10", 3, **given), 90, seed=0), play(envs.make("bp-10", 3, **arrays), 90, seed=0))
+    env = envs.make("ct-10", np.int64(3), n_agents=2.0, grid=np.array(6), slip=0, flicker=1)
+    assert env.obs_sizes == [4, 4] and env.reset(seed=0)[0].shape == (3, 2, 4) and type(env.grid) is int
+
+
+def test_checks_of_lists_and_of_what_must_be_positive():
+    np.testing.assert_array_equal(checks.rows("tables", [(1, 2)], 2), [[1.0, 2.0]])
+    np.testing.assert_array_equal(checks.positive("speeds", [1, 2], (2,)), [1.0, 2.0])
+    for check, message in (
+        (lambda: checks.rows("tables", [], 2), "tables must be a list with at least one entry, got []"),
+        (lambda: checks.rows("tables", 3, 2), "tables must be a list with at least one entry, got 3"),
+        (
+            lambda: checks.rows("tables", [(1, 2, 3)], 2),
+            "tables must be finite numbers of shape (1, 2), got [(1, 2, 3)]",
+        ),
+        (lambda: checks.positive("speed", 0), "speed must be above 0, got 0"),
+        (lambda: checks.numbers("slip", 2, low=0, high=1), "slip must be a finite number from 0 to 1, got 2"),
+        (lambda: checks.whole("copies", [1, 2.5], (2,)), "copies must be whole, got [1, 2.5]"),
+    ):
+        with pytest.raises(ValueError) as error:
+            check()
+        assert str(error.value) == message
 
 
 def test_keywords_change_the_task():
@@ -282,6 +372,16 @@ def test_pushing_rules():
     env, rewards, infos = push((1.5, 4.5), 0, steps=4)
     assert rewards == [-0.1, -0.1, -0.1, 9.9] and infos["macro_done"].all(), "small box 0 reaches the goal row"
     assert env.box_y[0].tolist() == [9.5, 5.5, 5.5] and not infos["success"][0]
+
+
+def test_both_may_push_one_small_box_beyond_the_goal_row():
+    """Agent 1 stands in the box's own cell, so that the box is in front of it after agent 0 has pushed it."""
+    places = {"small_boxes": [(1.5, 8.5), (8.5, 5.5)], "agent_starts": [(1.5, 7.5), (1.5, 8.5)]}
+    env = envs.make("bp-10", agent_orientations=(0, 0), **places)
+    env.reset(seed=0)
+    _, rewards, terminations, _, infos = env.step(np.array([[4, 4]]))
+    assert env.box_y[0].tolist() == [10.5, 5.5, 5.5] and env.position[0, :, 1].tolist() == [8.5, 9.5]
+    assert rewards[0] == pytest.approx(9.9) and terminations[0] and not infos["success"][0]
 
 
 def test_joint_push_needs_both_waypoints():
