@@ -239,7 +239,7 @@ class EpisodeBuffer:
             ("discount", np.float32),  # gamma^tau, or 0 if the episode terminates at the next row
         ]
         # An episode has at most a row for each step, and a last one for its final observation.
-        self.running = np.zeros((env.num_envs, env.horizon + 1), np.dtype(fields, align=True))
+        self.running = np.zeros((env.num_envs, env.horizon + 1), fields)
         self.running_rows = np.zeros(env.num_envs, np.int64)  # rows that each running episode has so far
         self.ended = []  # arrays of rows, one for each episode
 

@@ -156,13 +156,13 @@ class BoxPushing(MacroVectorEnv):
         self._place_agents_and_boxes(agent_starts, agent_orientations, small_boxes, big_box)
         names = PRIMITIVE_NAMES if self.primitive else MACRO_ACTION_NAMES
         super().__init__(
-            num_envs=checks.whole("num_envs", num_envs),
+            num_envs=num_envs,
             macro_action_names=[names, names],
             obs_low=np.zeros((2, 5)),
             obs_high=np.ones((2, 5)),
             obs_sizes=(5, 5),
             state_size=27,
-            horizon=checks.whole("horizon", horizon),
+            horizon=horizon,
             render_mode=render_mode,
         )
         self.position = np.zeros((self.num_envs, 2, 2))

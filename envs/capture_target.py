@@ -124,13 +124,13 @@ class CaptureTarget(MacroVectorEnv):
         agents = checks.whole("n_agents", n_agents)
         names = PRIMITIVE_NAMES if self.primitive else MACRO_ACTION_NAMES
         super().__init__(
-            num_envs=checks.whole("num_envs", num_envs),
+            num_envs=num_envs,
             macro_action_names=[names] * agents,
             obs_low=np.full((agents, 4), -1.0),
             obs_high=np.full((agents, 4), 1.0),
             obs_sizes=[4] * agents,
             state_size=2 * (agents + 1),
-            horizon=checks.whole("horizon", horizon),
+            horizon=horizon,
             render_mode=render_mode,
         )
         self.position = np.zeros((self.num_envs, agents, 2), np.int64)

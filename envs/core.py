@@ -8,6 +8,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from envs import checks
+
 
 class MacroVectorEnv(VectorEnv, ABC):
     """A batch of cooperative environments whose agents run macro-actions of different lengths.
@@ -61,14 +63,11 @@ class MacroVectorEnv(VectorEnv, ABC):
         Raises:
             ValueError: an argument is out of range.
         """
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if horizon < 1:
-            raise ValueError(f"horizon must be at least 1 step, got {horizon}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+        num_envs = checks.whole("num_envs", num_envs)
         self.num_envs = num_envs
-        self.horizon = horizon
+        self.horizon = checks.whole("horizon", horizon)
         self.render_mode = render_mode
         self.macro_action_names = [list(names) for names in macro_action_names]
         self.n_agents = len(macro_action_names)
@@ -234,10 +233,13 @@ class MacroVectorEnv(VectorEnv, ABC):
     def _update_available(self):
         """Sets `available`: for a free agent its initiation set, for a busy one only its running macro-action."""
         can_start = self._can_start() & self.own_actions
-        stuck = self.macro_done & ~can_start.any(axis=2)
-        if stuck.any():
-            env, agent = np.argwhere(stuck)[0]
+        is_empty = self.macro_done & ~can_start.any(axis=2)  # [N, n]
+        is_stuck = is_empty & ~self.over[:, None]
+        if is_stuck.any():
+            env, agent = np.argwhere(is_stuck)[0]
             raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
+        # Nobody chooses in an episode that is over, so an empty initiation set does no harm there.
+        can_start = np.where(is_empty[:, :, None], self.own_actions, can_start)
         is_running = self.macro_action[:, :, None] == np.arange(self.own_actions.shape[1])  # [N, n, A]
         self.available = np.where(self.macro_done[:, :, None], can_start, is_running)
 

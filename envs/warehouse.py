@@ -334,13 +334,13 @@ class Warehouse(MacroVectorEnv):
         arm_size = 3 * TOOLS + 1 + len(arm_names)
         humans_size = humans * (PHASES + 2)
         super().__init__(
-            num_envs=checks.whole("num_envs", num_envs),
+            num_envs=num_envs,
             macro_action_names=[robot_names] * robots + [arm_names],
             obs_low=np.zeros_like(obs_high),
             obs_high=obs_high,
             obs_sizes=[len(robot_high)] * robots + [len(arm_high)],
             state_size=robots_size + arm_size + humans_size,
-            horizon=checks.whole("horizon", horizon),
+            horizon=horizon,
             render_mode=render_mode,
         )
         self.position = np.zeros((self.num_envs, robots, 2))
