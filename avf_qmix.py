@@ -74,7 +74,7 @@ class Args:
     obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors, which rises to 1 once epsilon has fallen
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, as slowly
     hidden_size: int = 64  # width of the agents' layers
     ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities in the loss, see td_loss
     mixer_state: Literal["joint", "single", "real", "real-both", "decision"] = "joint"  # see mixer_states
@@ -185,7 +185,7 @@ def utilities_at_rows(agents, batch):
     free = batch["free"].movedim(2, 0)  # [n, B, T]
     decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
     row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
-    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], for some agents with busy rows, which nobody reads
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], filled up with busy rows, which nobody reads
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
     utilities, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
@@ -278,7 +278,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
+        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -328,7 +328,7 @@ def make_batch(episodes, device="cpu"):
 
 
 def mixer_states(batch, kind):
-    """What the mixer sees at each row, for the Q of the row and for the Q' with which the row before it bootstraps.
+    """The mixer's states at each row: for its Q, and for its Q', from which the row before bootstraps.
 
     Both are float32 [B, T, S], or [B, T, n * S] for "joint".
     """
@@ -338,10 +338,10 @@ def mixer_states(batch, kind):
     single = macro_state.take_along_dim(agent[..., None, None], 2)[:, :, 0]
     kinds = {
         "joint": (joint, joint),  # the macro-states of all agents, the paper's method
-        "single": (single, state),  # the macro-state of an agent that is free at the next row
-        "real": (last_state, state),  # the state at the last step before the next row, for Q' the row's state
-        "real-both": (last_state, last_state),
-        "decision": (state, state),  # the row's state
+        "single": (single, state),  # the macro-state of an agent free at the next row; for Q' the row's state
+        "real": (last_state, state),  # the state at the last step before the next row; for Q' the row's state
+        "real-both": (last_state, last_state),  # that last state for both
+        "decision": (state, state),  # the row's state for both
     }
     return kinds[kind]
 
@@ -362,10 +362,10 @@ def td_loss(utilities, target_utilities, mixer, target_mixer, batch, args, hyste
     state, next_state = mixer_states(batch, args.mixer_state)
     q = mixer(utilities, batch["action"], available, state)[:, :-1]  # [B, T - 1]
     with torch.no_grad():
-        next_q = target_mixer(target_utilities, best, available, next_state)[:, 1:]  # [B, T - 1]
+        next_q = target_mixer(target_utilities, best, available, next_state)[:, 1:]  # [B, T - 1], of the next row
         reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
         target = reward + discount * next_q
-        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]). A final row has no y.
+        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]), lambda = 0 before a final row.
         for k in reversed(range(target.shape[1] - 1)):
             bootstrap = torch.lerp(next_q[:, k], target[:, k + 1], args.td_lambda * valid[:, k + 1])
             target[:, k] = reward[:, k] + discount[:, k] * bootstrap
@@ -480,7 +480,7 @@ def train(args):
 
     while step < args.total_timesteps:
         # ---- act: one time step in every environment ----
-        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls while this is in [0, 1]
         epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
         actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
         buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
@@ -521,7 +521,7 @@ def train(args):
                 writer.add_scalar("losses/q_values", joint_q.mean(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # ---- evaluate, log, save ----
+        # ---- evaluate at each multiple of eval_frequency that was just passed; log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
             episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
             result = {name: values.mean().item() for name, values in episodes.items()}

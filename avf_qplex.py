@@ -18,11 +18,12 @@ most (for the others the rest is never available), d numbers of a macro-observat
 
 Numbered deviations from the paper:
  1. V_i is the best of what is available to agent i, so a busy agent has A_i = 0, as in the authors' later revision of
-    the paper. This version takes the best of all macro-actions (--no-mask-ongoing). A busy agent can then have A_i < 0,
-    weighted by lambda_i(s, m), which depends on the others' choices. So greedy agents may miss the team's best choice,
+    the paper. The paper takes the best of all macro-actions (--no-mask-ongoing). A busy agent can have A_i < 0 then,
+    weighted by lambda_i(s, m), which depends on the others' choices. Greedy agents may miss the team's best choice,
     which breaks Mac-IGM (theory/README.md).
- 2. A_i is Q_i - max Q_i (Eq. 4), not a dueling head (Def. 3.3), whose advantages of any sign break Mac-IGM, too.
- 3. The mixer's hypernetworks share a hidden layer of 128 units. The published ones have 320 in separate layers.
+ 2. A_i is Q_i - max Q_i as in Eq. 4. Def. 3.3 has a dueling head, whose advantages of any sign break Mac-IGM, too.
+ 3. The mixer has two hidden layers of 128 units, one for s, one for s and m. The published mixer has a small network
+    for each head and purpose.
  4. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
  5. Whole episodes are replayed, drawn with replacement, not windows of 25 rows. Targets are Q(lambda) returns. Negative
     TD errors count less while agents explore (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
@@ -80,7 +81,7 @@ class Args:
     obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors, which rises to 1 once epsilon has fallen
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, as slowly
     hidden_size: int = 64  # width of the agents' layers
     ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities in the loss, see td_loss
     mixer_state: Literal["joint", "single", "real", "real-both", "decision"] = "joint"  # see mixer_states
@@ -192,7 +193,7 @@ def utilities_at_rows(agents, batch):
     free = batch["free"].movedim(2, 0)  # [n, B, T]
     decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
     row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
-    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], for some agents with busy rows, which nobody reads
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], filled up with busy rows, which nobody reads
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
     utilities, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
@@ -203,17 +204,16 @@ class QPLEXMixer(nn.Module):
     """Duplex dueling (Eqs. 3 and 4; Wang et al. 2021): Q = sum_i (V_i + lambda_i A_i), A_i = Q_i - V_i, lambda_i > 0.
 
     Q_i and V_i are first transformed to w_i(s) Q_i + b_i(s) with w_i > 0; b_i cancels in A_i. lambda_i is a sum over
-    heads of key(s) sigmoid(agent_i(s)) sigmoid(action_i(s, m)). As it is positive, a worse choice of an agent never
-    raises its own term. own_actions: bool [n, A], which macro-actions each agent has.
+    heads of key(s) sigmoid(agent_i(s)) sigmoid(action_i(s, m)). As it is positive, an agent's term is largest, V_i, at
+    its best choice. own_actions: bool [n, A], which macro-actions each agent has.
     """
 
-    def __init__(self, own_actions, state_size, embed=32, heads=4, mask_ongoing=True):
+    def __init__(self, own_actions, state_size, hidden=128, heads=4, mask_ongoing=True):
         super().__init__()
         self.register_buffer("own_actions", own_actions, persistent=False)
         self.heads = heads
         self.mask_ongoing = mask_ongoing
         n_agents, n_actions = own_actions.shape
-        hidden = heads * embed
         joint_size = state_size + n_agents * n_actions
         state_outputs = 2 * n_agents + heads + heads * n_agents  # w_i, b_i, keys, agent_i
         self.state_net = nn.Sequential(nn.Linear(state_size, hidden), nn.ReLU(), nn.Linear(hidden, state_outputs))
@@ -229,11 +229,11 @@ class QPLEXMixer(nn.Module):
         n, n_actions = utilities.shape[-2:]
         q = utilities.gather(-1, actions[..., None])[..., 0]  # [B, T, n], Q_i(h_i, m_i)
         choices = available if self.mask_ongoing else self.own_actions
-        v = utilities.masked_fill(~choices, -torch.inf).amax(-1)  # [B, T, n], V_i(h_i)
+        v = utilities.masked_fill(~choices, -torch.inf).amax(-1)  # [B, T, n]
         weight, bias, key, agent_logits = self.state_net(state).split([n, n, self.heads, self.heads * n], -1)
         weight = weight.abs() + 1e-10  # positive: the transform keeps each agent's order of macro-actions
         key = key.abs() + 1e-10
-        advantage = (weight * (q - v)).detach()  # by this term lambda_i learns, the utilities do not
+        advantage = (weight * (q - v)).detach()  # lambda_i learns from it, the utilities do not
         joint_action = nn.functional.one_hot(actions, n_actions).flatten(-2)  # [B, T, n * A]
         action_logits = self.action_net(torch.cat([state, joint_action], -1))
         attention = torch.sigmoid(agent_logits) * torch.sigmoid(action_logits)
@@ -297,7 +297,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
+        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -347,7 +347,7 @@ def make_batch(episodes, device="cpu"):
 
 
 def mixer_states(batch, kind):
-    """What the mixer sees at each row, for the Q of the row and for the Q' with which the row before it bootstraps.
+    """The mixer's states at each row: for its Q, and for its Q', from which the row before bootstraps.
 
     Both are float32 [B, T, S], or [B, T, n * S] for "joint".
     """
@@ -357,10 +357,10 @@ def mixer_states(batch, kind):
     single = macro_state.take_along_dim(agent[..., None, None], 2)[:, :, 0]
     kinds = {
         "joint": (joint, joint),  # the macro-states of all agents, the paper's method
-        "single": (single, state),  # the macro-state of an agent that is free at the next row
-        "real": (last_state, state),  # the state at the last step before the next row, for Q' the row's state
-        "real-both": (last_state, last_state),
-        "decision": (state, state),  # the row's state
+        "single": (single, state),  # the macro-state of an agent free at the next row; for Q' the row's state
+        "real": (last_state, state),  # the state at the last step before the next row; for Q' the row's state
+        "real-both": (last_state, last_state),  # that last state for both
+        "decision": (state, state),  # the row's state for both
     }
     return kinds[kind]
 
@@ -381,10 +381,10 @@ def td_loss(utilities, target_utilities, mixer, target_mixer, batch, args, hyste
     state, next_state = mixer_states(batch, args.mixer_state)
     q = mixer(utilities, batch["action"], available, state)[:, :-1]  # [B, T - 1]
     with torch.no_grad():
-        next_q = target_mixer(target_utilities, best, available, next_state)[:, 1:]  # [B, T - 1]
+        next_q = target_mixer(target_utilities, best, available, next_state)[:, 1:]  # [B, T - 1], of the next row
         reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
         target = reward + discount * next_q
-        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]). A final row has no y.
+        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]), lambda = 0 before a final row.
         for k in reversed(range(target.shape[1] - 1)):
             bootstrap = torch.lerp(next_q[:, k], target[:, k + 1], args.td_lambda * valid[:, k + 1])
             target[:, k] = reward[:, k] + discount[:, k] * bootstrap
@@ -499,7 +499,7 @@ def train(args):
 
     while step < args.total_timesteps:
         # ---- act: one time step in every environment ----
-        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls while this is in [0, 1]
         epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
         actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
         buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
@@ -540,7 +540,7 @@ def train(args):
                 writer.add_scalar("losses/q_values", joint_q.mean(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # ---- evaluate, log, save ----
+        # ---- evaluate at each multiple of eval_frequency that was just passed; log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
             episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
             result = {name: values.mean().item() for name, values in episodes.items()}

@@ -76,7 +76,7 @@ class Args:
     obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors, which rises to 1 once epsilon has fallen
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, as slowly
     hidden_size: int = 64  # width of the network's layers
 
     def __post_init__(self):
@@ -216,7 +216,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
+        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -271,10 +271,10 @@ def td_loss(values, target_values, team, batch, args, hysteresis=1.0):
     with torch.no_grad():
         choices = values.masked_fill(~team.all_available(batch["available"]), -torch.inf)
         best = choices.argmax(-1)  # [B, T], m*
-        next_q = target_values.gather(-1, best[..., None])[:, 1:, 0]  # [B, T - 1]
+        next_q = target_values.gather(-1, best[..., None])[:, 1:, 0]  # [B, T - 1], of the next row
         reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
         target = reward + discount * next_q
-        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]). A final row has no y.
+        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]), lambda = 0 before a final row.
         for k in reversed(range(target.shape[1] - 1)):
             bootstrap = torch.lerp(next_q[:, k], target[:, k + 1], args.td_lambda * valid[:, k + 1])
             target[:, k] = reward[:, k] + discount[:, k] * bootstrap
@@ -389,7 +389,7 @@ def train(args):
 
     while step < args.total_timesteps:
         # ---- act: one time step in every environment ----
-        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls while this is in [0, 1]
         epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
         actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
         buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
@@ -427,7 +427,7 @@ def train(args):
                 writer.add_scalar("losses/q_values", q.mean(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # ---- evaluate, log, save ----
+        # ---- evaluate at each multiple of eval_frequency that was just passed; log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
             episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
             result = {name: values.mean().item() for name, values in episodes.items()}

@@ -83,10 +83,8 @@ class Args:
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
     reward_scale: float = 0.01  # factor on rewards inside the loss; logged returns are unscaled
-    hysteresis: float = (
-        1.0  # factor on critics' negative errors; when epsilon has fallen it rises to 1 in as many steps
-    )
-    hidden_size: int = 64  # width of the actors' and critics' layers
+    hysteresis: float = 1.0  # factor on critics' negative errors; rises to 1 after epsilon's fall, as slowly
+    hidden_size: int = 64  # width of the networks' layers
 
     def __post_init__(self):
         problem = envs.problem(self.env)
@@ -193,7 +191,7 @@ def logits_at_rows(agents, batch):
     free = batch["free"].movedim(2, 0)  # [n, B, T]
     decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
     row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
-    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], for some agents with busy rows, which nobody reads
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], filled up with busy rows, which nobody reads
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
     logits, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
@@ -272,7 +270,7 @@ class EpisodeBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. A final row has what the agents, all free, see."""
+        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -466,7 +464,7 @@ def train(args):
 
     while step < args.total_timesteps:
         # ---- act: one time step in every environment ----
-        phase = (step - args.random_timesteps) / args.exploration_timesteps  # epsilon falls from 0 to 1
+        phase = (step - args.random_timesteps) / args.exploration_timesteps  # epsilon falls while this is in [0, 1]
         epsilon = np.interp(phase, [0, 1], [args.start_e, args.end_e]) if phase >= 0 else 1.0
         actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
         buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
@@ -507,7 +505,7 @@ def train(args):
                 writer.add_scalar("losses/values", values[batch["valid"]].mean(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm, step)
 
-        # ---- evaluate, log, save ----
+        # ---- evaluate at each multiple of eval_frequency that was just passed; log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
             episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
             result = {name: values.mean().item() for name, values in episodes.items()}
