@@ -10,8 +10,8 @@ Reinforcement Learning"). Three ideas carry the whole file:
     available  What an agent can do at a row. A free agent chooses among the macro-actions that it can start. A busy
                agent can only go on. So the paper's argmax given the macro-actions of the busy agents (Eqs. 5 and 7)
                is simply an argmax over what is available.
-    target     y = r + gamma^tau Q'(h', m*) (Eq. 14), tau steps later, at the next row. Q' is the target network, and
-               m* is the argmax of the online network over what is available there (double Q).
+    target     y = r + gamma^tau Q'(h', m*) (Eq. 14). h' and m* are of the next row, tau steps later. Q' is the target
+               network, and m* is the argmax of the online network over what is available there (double Q).
 
 Shapes: N environments, B episodes, T rows, L decisions of an agent, n agents, A macro-actions of the agent that has
 most (for the others the rest is never available), d numbers of a macro-observation, H hidden units.
@@ -48,7 +48,7 @@ AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteres
 @dataclass
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
-    seed: int = 1  # of networks, exploration, replay and environments, from 0 on
+    seed: int = 1  # of networks, exploration, replay and environments; at least 0
     total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
@@ -71,12 +71,12 @@ class Args:
     end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
-    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, as slowly
+    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
+    hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
     hidden_size: int = 64  # width of the agents' layers
-    ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities in the loss, see td_loss
+    ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities: learn, have no gradient, are 0
 
     def __post_init__(self):
         problem = envs.problem(self.env)
@@ -182,9 +182,9 @@ def utilities_at_rows(agents, batch):
     At a row at which the agent is busy, its utilities are those of its latest decision.
     """
     free = batch["free"].movedim(2, 0)  # [n, B, T]
-    decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
-    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
-    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], filled up with busy rows, which nobody reads
+    decision = free.cumsum(2) - 1  # [n, B, T], index of the latest decision: 0 0 1 if free is 1 0 1
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first: 0 2 1
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L]; after an agent's last decision come busy rows, never read
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
     utilities, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
@@ -200,7 +200,7 @@ def mix(utilities, actions):
 
 
 class ReplayBuffer:
-    """Episodes as rows (Fig. 2): those that run in the N environments, and the last `capacity` that have ended.
+    """Episodes as rows: those that run in the N environments, and the last `capacity` that have ended.
 
     A row is a record of a NumPy structured array.
     """
@@ -249,7 +249,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
+        """Gives episodes that are over, bool [N], a final row, where all agents are free, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -288,7 +288,7 @@ def make_batch(episodes, device="cpu"):
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # what it ran before it chose
     batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
     batch["previous"] = np.where(since > 0, previous, -1)
@@ -296,7 +296,7 @@ def make_batch(episodes, device="cpu"):
 
 
 def td_loss(utilities, target_utilities, batch, args, hysteresis=1.0):
-    """The loss of Eq. 14, and the joint values and their targets, float32 [number of valid rows].
+    """The loss of Eq. 14 with Q(lambda) targets, and joint values and targets, float32 [number of valid rows].
 
     utilities, target_utilities: float32 [B, T, n, A], of the online and of the target networks.
     """
@@ -313,7 +313,7 @@ def td_loss(utilities, target_utilities, batch, args, hysteresis=1.0):
         next_q = mix(target_utilities, best)[:, 1:]  # [B, T - 1], of the next row
         reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
         target = reward + discount * next_q
-        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]), lambda = 0 before a final row.
+        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) next_q[k] + lambda y[k + 1]), lambda = 0 if k + 1 is final.
         for k in reversed(range(target.shape[1] - 1)):
             bootstrap = torch.lerp(next_q[:, k], target[:, k + 1], args.td_lambda * valid[:, k + 1])
             target[:, k] = reward[:, k] + discount[:, k] * bootstrap
@@ -419,7 +419,7 @@ def train(args):
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    writer = SummaryWriter(folder, purge_step=step + 1)  # drops what was logged after the checkpoint
     print(folder)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
     saved_at = -np.inf  # so there is a checkpoint from the first step on
@@ -515,7 +515,7 @@ def load(path):
 
 
 def parse_args(argv=None):
-    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
+    """The task's defaults, overridden by the command line, or with --resume the settings of that run."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")

@@ -2,15 +2,15 @@
 
 This is the fully centralised baseline of Xiao et al. (2020, "Macro-action-based deep multi-agent reinforcement
 learning"). "The paper" below is "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning", which
-describes it in Section 2.2. It sees every macro-observation and chooses for every free agent. So it knows
-all that there is to know, but it has as many outputs as there are joint macro-actions, and agents could not execute it
-on their own. Three ideas carry the whole file:
+describes it in Section 2.2. The network sees every macro-observation and chooses for every free agent. So it
+knows all that the agents know, but it has as many outputs as there are joint macro-actions, and agents could not
+execute it on their own. Three ideas carry the whole file:
 
     row        A time step at which at least one agent is free and starts a macro-action. The team decides at every row.
     available  A joint macro-action is available if each of its parts is. A free agent's part is a macro-action that it
                can start, a busy agent's part is the one that it runs.
-    target     y = r + gamma^tau Q'(h', m*) (Eq. 5), tau steps later, at the next row. Q' is the target network, and m*
-               is the argmax of the online network over what is available there (double Q).
+    target     y = r + gamma^tau Q'(h', m*) (Eq. 5). h' and m* are of the next row, tau steps later. Q' is the target
+               network, and m* is the argmax of the online network over what is available there (double Q).
 
 Shapes: N environments, B episodes, T rows, n agents, A macro-actions of the agent that has most (for the others the
 rest is never available), J joint macro-actions, d numbers of a macro-observation, H hidden units.
@@ -50,7 +50,7 @@ AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteres
 @dataclass
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
-    seed: int = 1  # of networks, exploration, replay and environments, from 0 on
+    seed: int = 1  # of networks, exploration, replay and environments; at least 0
     total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
@@ -73,10 +73,10 @@ class Args:
     end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
-    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, as slowly
+    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
+    hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
     hidden_size: int = 64  # width of the network's layers
 
     def __post_init__(self):
@@ -120,9 +120,9 @@ class Team(nn.Module):
 
     def __init__(self, n_actions, obs_size, hidden_size, obs_scale=1.0):
         super().__init__()
-        self.n_actions = max(n_actions)
+        self.n_actions = max(n_actions)  # A
         self.obs_scale = obs_scale
-        # Row j lists the agents' macro-actions in joint macro-action j: numbers int64 [J, n], and one-hot [J, n * A].
+        # The agents' macro-actions in each joint macro-action: numbers, int64 [J, n], and one-hot, float32 [J, n * A].
         parts = torch.from_numpy(np.indices(n_actions).reshape(len(n_actions), -1).T.copy())
         one_hot_parts = nn.functional.one_hot(parts, self.n_actions).flatten(1).float()
         self.register_buffer("parts", parts, persistent=False)
@@ -167,7 +167,7 @@ def values_at_rows(team, batch):
 
 
 class ReplayBuffer:
-    """Episodes as rows (Fig. 2): those that run in the N environments, and the last `capacity` that have ended.
+    """Episodes as rows: those that run in the N environments, and the last `capacity` that have ended.
 
     A row is a record of a NumPy structured array.
     """
@@ -216,7 +216,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
+        """Gives episodes that are over, bool [N], a final row, where all agents are free, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -255,7 +255,7 @@ def make_batch(episodes, device="cpu"):
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # what it ran before it chose
     batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
     batch["previous"] = np.where(since > 0, previous, -1)
@@ -263,7 +263,7 @@ def make_batch(episodes, device="cpu"):
 
 
 def td_loss(values, target_values, team, batch, args, hysteresis=1.0):
-    """The loss of Eq. 5, and the values and their targets, float32 [number of valid rows].
+    """The loss of Eq. 5 with Q(lambda) targets, and values and targets, float32 [number of valid rows].
 
     values, target_values: float32 [B, T, J], of the online and of the target network.
     """
@@ -274,7 +274,7 @@ def td_loss(values, target_values, team, batch, args, hysteresis=1.0):
         next_q = target_values.gather(-1, best[..., None])[:, 1:, 0]  # [B, T - 1], of the next row
         reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
         target = reward + discount * next_q
-        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) Q'[k + 1] + lambda y[k + 1]), lambda = 0 before a final row.
+        # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) next_q[k] + lambda y[k + 1]), lambda = 0 if k + 1 is final.
         for k in reversed(range(target.shape[1] - 1)):
             bootstrap = torch.lerp(next_q[:, k], target[:, k + 1], args.td_lambda * valid[:, k + 1])
             target[:, k] = reward[:, k] + discount[:, k] * bootstrap
@@ -329,7 +329,7 @@ def evaluate(agents, env, gamma, seed):
 
 
 def make_learner(args, env):
-    """The team's network, under the name that it has in all scripts, on the device."""
+    """The team's network on the device, called "agents" as in the other scripts."""
     n_joint_actions = np.prod(env.n_actions, dtype=float)
     if n_joint_actions > 2**15:
         raise SystemExit(f"{args.env} has {n_joint_actions:,.0f} joint macro-actions, the limit is {2**15:,}")
@@ -382,7 +382,7 @@ def train(args):
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    writer = SummaryWriter(folder, purge_step=step + 1)  # drops what was logged after the checkpoint
     print(folder)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
     saved_at = -np.inf  # so there is a checkpoint from the first step on
@@ -478,7 +478,7 @@ def load(path):
 
 
 def parse_args(argv=None):
-    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
+    """The task's defaults, overridden by the command line, or with --resume the settings of that run."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")

@@ -54,7 +54,7 @@ AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteres
 @dataclass
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
-    seed: int = 1  # of networks, exploration, replay and environments, from 0 on
+    seed: int = 1  # of networks, exploration, replay and environments; at least 0
     total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
@@ -77,10 +77,10 @@ class Args:
     end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
-    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 is the paper's one-row target
-    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, as slowly
+    td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
+    hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
     hidden_size: int = 64  # width of the agents' layers
 
     def __post_init__(self):
@@ -187,9 +187,9 @@ def utilities_at_rows(agents, batch):
     At a row at which the agent is busy, its utilities are those of its latest decision.
     """
     free = batch["free"].movedim(2, 0)  # [n, B, T]
-    decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
-    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
-    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], filled up with busy rows, which nobody reads
+    decision = free.cumsum(2) - 1  # [n, B, T], index of the latest decision: 0 0 1 if free is 1 0 1
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first: 0 2 1
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L]; after an agent's last decision come busy rows, never read
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
     utilities, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
@@ -197,7 +197,7 @@ def utilities_at_rows(agents, batch):
 
 
 class ReplayBuffer:
-    """Episodes as rows (Fig. 2): those that run in the N environments, and the last `capacity` that have ended.
+    """Episodes as rows: those that run in the N environments, and the last `capacity` that have ended.
 
     A row is a record of a NumPy structured array.
     """
@@ -246,7 +246,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
+        """Gives episodes that are over, bool [N], a final row, where all agents are free, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -285,7 +285,7 @@ def make_batch(episodes, device="cpu"):
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # what it ran before it chose
     batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
     batch["previous"] = np.where(since > 0, previous, -1)
@@ -426,7 +426,7 @@ def train(args):
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    writer = SummaryWriter(folder, purge_step=step + 1)  # drops what was logged after the checkpoint
     print(folder)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
     saved_at = -np.inf  # so there is a checkpoint from the first step on
@@ -522,7 +522,7 @@ def load(path):
 
 
 def parse_args(argv=None):
-    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
+    """The task's defaults, overridden by the command line, or with --resume the settings of that run."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")

@@ -8,8 +8,8 @@ joint macro-history and are needed for learning only. Four ideas carry the whole
     available  What an agent can do at a row. A free agent chooses among the macro-actions that it can start. A busy
                agent can only go on.
     return     G_i = r_1 + gamma^tau_1 r_2 + ... + gamma^(tau_1 + ... + tau_l) V'_i over the next l = n_step
-               macro-actions of agent i. r_j is the discounted reward of the tau_j steps of the j-th, V'_i is the target
-               critic. Returns begin where agent i chooses, and only there its critic V_i and its policy learn.
+               macro-actions of agent i. r_j is the discounted reward of the tau_j steps of macro-action j. V'_i is the
+               target critic. Returns begin where agent i chooses, and only there its critic V_i and its policy learn.
     actor      It follows the gradient of log pi_i(m_i | h_i) (G_i - V_i). The policy pi_i is epsilon-soft: a softmax
                over what is available, mixed with the uniform policy over it.
 
@@ -57,7 +57,7 @@ AT_MOST_1 = ("learning_rate", "gamma", "polyak", "start_e", "end_e", "hysteresis
 @dataclass
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
-    seed: int = 1  # of networks, exploration and environments, from 0 on
+    seed: int = 1  # of networks, exploration and environments; at least 0
     total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 4  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
@@ -81,9 +81,9 @@ class Args:
     end_e: float = 0.01  # final epsilon
     entropy_coef: float = 0.01  # weight of the policies' entropy in the loss; bigger explores longer
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
-    obs_scale: float = 1.0  # factor on macro-observations in the networks; a larger one tells close ones apart
+    obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.01  # factor on rewards inside the loss; logged returns are unscaled
-    hysteresis: float = 1.0  # factor on critics' negative errors; rises to 1 after epsilon's fall, as slowly
+    hysteresis: float = 1.0  # factor on critics' negative errors; after epsilon's fall it rises to 1 over as many steps
     hidden_size: int = 64  # width of the networks' layers
 
     def __post_init__(self):
@@ -189,9 +189,9 @@ def logits_at_rows(agents, batch):
     At a row at which the agent is busy, its logits are those of its latest decision.
     """
     free = batch["free"].movedim(2, 0)  # [n, B, T]
-    decision = free.cumsum(2) - 1  # [n, B, T], the number of the agent's latest decision
-    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first
-    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L], filled up with busy rows, which nobody reads
+    decision = free.cumsum(2) - 1  # [n, B, T], index of the latest decision: 0 0 1 if free is 1 0 1
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first: 0 2 1
+    row = row[:, :, : int(decision.max()) + 1]  # [n, B, L]; after an agent's last decision come busy rows, never read
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
     logits, _ = agents(obs, previous, agents.start(len(batch["obs"])))  # [n, B, L, A]
@@ -206,7 +206,7 @@ class Critics(nn.Module):
         self.n_actions = n_actions
         self.obs_scale = obs_scale
         joint_size = n_agents * (obs_size + 1 + n_actions)
-        self.networks = Agents(n_agents, 1, joint_size, hidden_size)  # one output: the value
+        self.networks = Agents(n_agents, 1, joint_size, hidden_size)  # one output; one input stays 0
 
     def forward(self, batch):
         """Values float32 [B, T, n] at every row. A critic sees what all agents saw and did last, and who is free."""
@@ -215,13 +215,13 @@ class Critics(nn.Module):
         one_hot = nn.functional.one_hot(latest + 1, self.n_actions + 1)[..., 1:]  # zeros for none
         joint = torch.cat([self.obs_scale * batch["obs"], free[..., None], one_hot], -1).flatten(2)
         joint = joint.expand(free.shape[2], *joint.shape)  # [n, B, T, n * (d + 1 + A)], the same for all
-        none = joint.new_full(joint.shape[:3], -1, dtype=torch.int64)  # joint has the macro-actions already
+        none = joint.new_full(joint.shape[:3], -1, dtype=torch.int64)  # no previous macro-action: joint has them all
         values, _ = self.networks(joint, none, self.networks.start(len(free)))
         return values[..., 0].movedim(0, 2)
 
 
 class EpisodeBuffer:
-    """Episodes as rows (Fig. 2): those that run in the N environments, and those that have ended since the last update.
+    """Episodes as rows: those that run in the N environments, and those that have ended since the last update.
 
     A row is a record of a NumPy structured array.
     """
@@ -270,7 +270,7 @@ class EpisodeBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to the ended ones. The action of a final row counts for nothing."""
+        """Gives episodes that are over, bool [N], a final row, where all agents are free, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -305,7 +305,7 @@ def make_batch(episodes, device="cpu"):
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # not used where since is 0
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # what it ran before it chose
     batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
     batch["previous"] = np.where(since > 0, previous, -1)
@@ -322,14 +322,14 @@ def own_returns(values, batch, n_step):
     values: float32 [B, T, n], V'_i of each agent's target critic. n_step: the l of the returns.
     """
     returns = torch.zeros_like(values)
-    x = values.new_zeros(n_step, *values[:, 0].shape)  # X_1 to X_{n_step} at a row, [n_step, B, n]
+    x = values.new_zeros(n_step, *values[:, 0].shape)  # X_1 to X_{n_step}, [n_step, B, n]
     for k in reversed(range(values.shape[1] - 1)):
         next_value = values[:, k + 1]  # [B, n]
         is_final = ~batch["valid"][:, k + 1, None]  # [B, 1]
-        x = torch.where(is_final, next_value, x)
-        one_less = torch.cat([next_value[None], x[:-1]])  # X_0 to X_{n_step - 1}
+        x = torch.where(is_final, next_value, x)  # at row k + 1
+        one_less = torch.cat([next_value[None], x[:-1]])  # X_0 to X_{n_step - 1} there
         x = torch.where(batch["free"][:, k + 1], one_less, x)
-        x = batch["reward"][:, k, None] + batch["discount"][:, k, None] * x
+        x = batch["reward"][:, k, None] + batch["discount"][:, k, None] * x  # at row k
         returns[:, k] = x[-1]
     return returns
 
@@ -338,7 +338,7 @@ def soft_policy(logits, available, epsilon):
     """(1 - epsilon) softmax + epsilon uniform, over what is available: probabilities float32 [..., A]."""
     softmax = logits.masked_fill(~available, -torch.inf).softmax(-1)
     uniform = available / available.sum(-1, keepdim=True)
-    return (1 - epsilon) * softmax + epsilon * uniform
+    return (1 - epsilon) * softmax + epsilon * uniform  # no gradient if epsilon is 1
 
 
 def actor_critic_loss(policy, values, returns, batch, entropy_coef, hysteresis=1.0):
@@ -457,7 +457,7 @@ def train(args):
         import wandb  # optional: pip install -e '.[track]'
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
-    writer = SummaryWriter(folder, purge_step=step + 1)  # what was logged after the checkpoint is dropped
+    writer = SummaryWriter(folder, purge_step=step + 1)  # drops what was logged after the checkpoint
     print(folder)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
     saved_at = -np.inf  # so there is a checkpoint from the first step on
@@ -556,7 +556,7 @@ def load(path):
 
 
 def parse_args(argv=None):
-    """Args from the command line over the task's defaults or, with --resume, those of the run to go on with."""
+    """The task's defaults, overridden by the command line, or with --resume the settings of that run."""
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
