@@ -26,11 +26,11 @@ MACRO_ACTION_NAMES = [
 WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT = 2, 3
 PUSH, TURN_LEFT, TURN_RIGHT, STAY = 4, 5, 6, 7
 
-# A primitive action does one step of the macro-action that has its place in PRIMITIVE_TO_MACRO.
+# Primitive action i does one step of macro-action PRIMITIVE_TO_MACRO[i].
 PRIMITIVE_NAMES = ["Forward", "Turn-left", "Turn-right", "Stay"]
 PRIMITIVE_TO_MACRO = np.array([PUSH, TURN_LEFT, TURN_RIGHT, STAY])
 
-# What turning costs Go-to, by the number of quarter turns to the right. Three of them are one to the left.
+# Go-to chooses its next cell by costs (no rewards). That of 0 to 3 quarter turns to the right; three are one to the left.
 TURN_COST = np.array([0.0, 0.1, 0.2, 0.1])
 SMALL, BIG = slice(0, 2), 2  # boxes 0 and 1 are small, box 2 is big
 
@@ -43,20 +43,23 @@ class BoxPushing(MacroVectorEnv):
     Boxes move north only. Agents do not block each other. Positions are cell centres (0.5, 1.5, ...), x to the east
     and y to the north. The goal row is the northernmost row. Each step, in this order:
 
-    1. If the agents begin a joint push (see below), they are locked onto the big box from now on.
+    1. If the agents begin a joint push (see below), they are locked onto the big box from this step on.
     2. Agent 0 acts, then agent 1. Agents that are locked onto the big box do nothing here.
     3. If the agents are locked onto the big box, it moves one cell north, and both agents move with it.
     4. The episode terminates if a box stands on the goal row.
 
     ## Macro-actions
-    - 0, 1 Go-to-Small-Box(0, 1) and 2, 3 Go-to-Big-Box(left, right): the agent walks to its waypoint and ends there
-      facing north. The waypoint is the cell below the place where the small box, or that half of the big box, was at
-      the start. It does not move with the box. An agent that is at its waypoint when a step begins turns north in this
-      step, whatever its orientation, and ends. Any other looks at its four neighbour cells in the order N, E, S, W:
+    - 0, 1 Go-to-Small-Box(0, 1) and 2, 3 Go-to-Big-Box(left, right): the agent walks to its waypoint. The waypoint is
+      the cell below the place where the small box, or that half of the big box, was at the start. It does not move with
+      the box. Go-to ends as soon as the agent is at its waypoint and faces north. An agent that arrives with another
+      orientation turns north in the next step, in one turn. An agent that is not there yet looks at its four neighbour
+      cells in the order N, E, S, W:
         - The cost of a cell is its Manhattan distance to the waypoint, plus 0.1 for each quarter turn that the agent
           needs to face it.
-        - A cell costs infinitely much if it has the y of small box 0 and the x of a small box or of either half of the
-          big one. At the start of the published benchmark these are the cells of all boxes.
+        - What blocks the way are the four cells in the present row of small box 0 and in the columns of the two small
+          boxes and of the two halves of the big one. They cost infinitely much. At the published start these are the
+          boxes' own cells; later on they need not be. The boundary blocks nothing. Both are quirks of the published
+          benchmark, and they are kept.
         - The agent chooses the cheapest cell, the first of equals. If it faces the cell, it moves there. If the cell is
           behind it, it makes one quarter turn to the right. Otherwise it turns to face the cell.
     - 4 Push: what it does depends on the cell in front of the agent.
@@ -65,14 +68,14 @@ class BoxPushing(MacroVectorEnv):
         - The boundary of the grid, the big box, or a small box while the agent does not face north: the agent stays
           where it is, gets a penalty, and Push ends.
         - Anything else: the agent moves one cell forward. Push ends when it then has the boundary in front of it.
-    - Joint push: it begins if both agents start Push in the same step, both face north, and one of them last reached
-      the left waypoint of the big box and the other one the right waypoint. The agents may have left these waypoints
-      since. This is a quirk of the published benchmark, and it is kept. A joint push goes on until the big box is on
-      the goal row.
+    - Joint push: it begins if both agents start Push in the same step, both face north, and of the Go-tos that each of
+      them has finished last, one is Go-to-Big-Box(left) and the other Go-to-Big-Box(right). The agents may have left
+      these waypoints since. This is a quirk of the published benchmark, and it is kept. A joint push goes on until the
+      big box is on the goal row.
     - 5 Turn-left, 6 Turn-right, 7 Stay: they last one step.
 
     With `primitive=True` the actions are 0 Forward, 1 Turn-left, 2 Turn-right and 3 Stay, one step each. Forward is one
-    step of Push. The big box moves one cell if one agent stands below its left half and the other one below its right
+    step of Push. A joint push lasts one step: the big box moves one cell if one agent stands below its left half and the other one below its right
     half, and both face north and move Forward in the same step.
 
     ## Macro-observations
@@ -82,7 +85,7 @@ class BoxPushing(MacroVectorEnv):
     ## Rewards
     The reward of a step is the sum of these. By default `step_cost` and `penalty` are negative.
 
-    - `step_cost` every step. The paper (see Source) does not mention it, but the published benchmark has it.
+    - `step_cost` every step. The paper of AVF (see Source) does not mention it, but the published benchmark has it.
     - `penalty` for each agent that gets a penalty in the step.
     - `small_reward` for each small box on the goal row, `big_reward` for the big one.
 
@@ -95,7 +98,7 @@ class BoxPushing(MacroVectorEnv):
 
     - 0 to 11: for each agent x / grid, y / grid and its orientation, one-hot (4)
     - 12 to 17: for each box (small 0, small 1, big) x / grid, y / grid
-    - 18 to 25: for each agent the waypoint that it reached last, one-hot (4), all 0 before the first
+    - 18 to 25: for each agent the Go-to that it finished last, one-hot (4), all 0 before the first
     - 26: whether the agents are locked onto the big box
 
     ## Arguments
@@ -117,12 +120,13 @@ class BoxPushing(MacroVectorEnv):
     ## Simulator arrays
     - position float64 [N, 2, (x, y)] and orientation int64 [N, 2] of the agents
     - box_y float64 [N, 3] of the boxes, whose x never changes
-    - last_waypoint int64 [N, 2]: the waypoint that each agent reached last, -1 before the first
+    - last_waypoint int64 [N, 2]: the Go-to that each agent finished last, -1 before the first
     - pushing_big bool [N]: whether the agents are locked onto the big box
 
     ## Source
     Y. Xiao, J. Hoffman, C. Amato, "Macro-Action-Based Deep Multi-Agent Reinforcement Learning", CoRL 2019. Rewards and
-    constants are those of Appendix D.1 of "the paper", the one on asynchronous value factorization.
+    constants are those of Appendix D.1 of the paper of AVF, "Value Factorization for Asynchronous Multi-Agent
+    Reinforcement Learning".
     """
 
     sim_arrays = ("position", "orientation", "box_y", "last_waypoint", "pushing_big")
@@ -195,7 +199,7 @@ class BoxPushing(MacroVectorEnv):
         _check_cells("the two cells of big_box", big_box, big_halves, lowest=(0.5, 1.5), highest=(last, last - 1))
 
         box_cells = np.concatenate([small, big_halves])  # [4, (x, y)]: small 0 and 1, left and right half
-        self.cell_x = box_cells[:, 0]
+        self.cell_x = box_cells[:, 0]  # [4], in the order of the waypoints
         self.waypoints = box_cells - (0.0, 1.0)  # [4, (x, y)], below these cells
         boxes = np.concatenate([small, big[None]])  # [3, (x, y)]: small 0, small 1, big
         self.box_x = boxes[:, 0]
@@ -225,8 +229,8 @@ class BoxPushing(MacroVectorEnv):
             penalised[:, agent] = push_penalised
 
         self._push_big_box()
-        # A small box can be beyond the goal row. If agent 1 stands in the cell of the box, agent 0 can push the box one
-        # cell north and then agent 1 one cell more, in the same step.
+        # A small box can move two cells in a step, beyond the goal row: if agent 0 pushes it into the cell in front of
+        # agent 1, agent 1 pushes it on.
         on_goal_row = self.box_y >= self.goal_y  # [N, boxes]
         small_on_goal_row = on_goal_row[:, SMALL]
         big_on_goal_row = on_goal_row[:, BIG]
@@ -245,7 +249,8 @@ class BoxPushing(MacroVectorEnv):
 
     def _lock_onto_big_box(self, action):
         """Begins a joint push where both agents start Push and face north, one at each half of the big box."""
-        both_start_push = (self.macro_done & (action == PUSH)).all(axis=1)
+        starts = self.macro_done  # free up to this step
+        both_start_push = (starts & (action == PUSH)).all(axis=1)
         both_face_north = (self.orientation == NORTH).all(axis=1)
         if self.primitive:  # the agents' cells count
             x = self.position[:, :, 0]
@@ -273,11 +278,11 @@ class BoxPushing(MacroVectorEnv):
         is_behind = cheapest == (orientation + 2) % 4
         moves = walks & is_ahead
         turns_right = walks & is_behind
-        faces_it = walks & ~is_ahead & ~is_behind
+        turns_to_it = walks & ~is_ahead & ~is_behind
         orientation[is_there] = NORTH
         position[moves] += FORWARD[cheapest[moves]]
         orientation[turns_right] += 1
-        orientation[faces_it] = cheapest[faces_it]
+        orientation[turns_to_it] = cheapest[turns_to_it]
         orientation %= 4
 
         is_now_there = (position == waypoint).all(axis=1)

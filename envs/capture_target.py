@@ -34,11 +34,13 @@ class CaptureTarget(MacroVectorEnv):
     - 0 Move-to-T: the agent moves towards its goal. It ends when the agent stands on its goal, wherever the target is
       by then. Each step:
         - If the primitive observation of the step before shows the target, the target's position in it becomes the
-          goal. Otherwise the goal stays what it was. It stays also when the macro-action ends, until the episode ends.
+          goal. Otherwise the agent keeps its old goal. A goal is kept from one Move-to-T to the next and is forgotten
+          only at a reset.
         - An agent that still has no goal does not move, and its macro-action ends in this step.
         - An agent with a goal moves to the one of five cells that is nearest to the goal: its own cell and those to the
           N, S, W and E of it, wrapped around the border. The distance is the plain Euclidean one, which does not wrap.
-          Ties are broken evenly at random.
+          So an agent crosses the border only from a cell beside it, if it lands nearer to the goal; from farther away
+          it takes the long way. Ties are broken evenly at random.
     - 1 Stay: the agent stays for one step.
 
     A move goes to the left or to the right of its direction instead (it slips) with probability `slip` / 2 each.
@@ -94,7 +96,8 @@ class CaptureTarget(MacroVectorEnv):
 
     ## Source
     Y. Xiao, J. Hoffman, C. Amato, "Macro-Action-Based Deep Multi-Agent Reinforcement Learning", CoRL 2019, with two
-    agents. The task with ten is that of Appendix D.3 of the paper on asynchronous value factorization.
+    agents. The task with ten is that of Appendix D.3 of the paper of AVF, "Value Factorization for
+    Asynchronous Multi-Agent Reinforcement Learning".
     """
 
     sim_arrays = ("position", "target", "visible", "goal")

@@ -98,9 +98,10 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     @abstractmethod
     def _advance(self):
-        """Takes one step of every agent's `macro_action`, the first one where `macro_done` is True.
+        """Takes one step of the macro-action that each agent runs.
 
-        `elapsed` already counts this step.
+        `macro_done` is still that of the step before: where it is True, the agent starts its `macro_action` in this
+        step. `elapsed` already counts this step.
 
         Returns:
             rewards float64 [N]
@@ -195,7 +196,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         np.copyto(self.macro_action, actions, where=self.macro_done, casting="unsafe")
         self.elapsed += 1
         rewards, terminations, ended, success = self._advance()
-        self.success = success.copy()  # reset writes into it, and terminations may be the same array
+        self.success = success.copy()  # a later reset writes into it, and a domain may return one array for both
         truncations = (self.elapsed >= self.horizon) & ~terminations
         self.over = terminations | truncations
         self.macro_done = ended | self.over[:, None]
@@ -238,7 +239,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         if is_stuck.any():
             env, agent = np.argwhere(is_stuck)[0]
             raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
-        # Nobody chooses in an episode that is over, so an empty initiation set does no harm there.
+        # Nobody chooses in an episode that is over. An empty set is filled there, so that whoever masks with it can.
         can_start = np.where(is_empty[:, :, None], self.own_actions, can_start)
         is_running = self.macro_action[:, :, None] == np.arange(self.own_actions.shape[1])  # [N, n, A]
         self.available = np.where(self.macro_done[:, :, None], can_start, is_running)

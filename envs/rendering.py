@@ -77,10 +77,6 @@ class Canvas:
         (at,), stroke = self._points([(x, y)]), round(size / 44) if bold else 0
         self.draw.text(at, str(words), fill, _font(size), anchor + "m", stroke_width=stroke)
 
-    def width(self, words, size=14.0):
-        """How wide the text would be."""
-        return _font(max(size * self.unit, 10)).getlength(str(words)) / self.unit
-
     def pixels(self):
         """uint8 [height, width, 3]."""
         return np.array(self.image.reduce(2))  # LANCZOS looks the same and takes several times as long

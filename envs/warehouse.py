@@ -6,7 +6,7 @@ from envs import checks
 from envs.core import MacroVectorEnv
 
 TOOLS = 3  # kinds of tools
-PHASES = 4  # of a human's work: tool k is needed for phase k + 1
+PHASES = 4  # 0 to 3, of a human's work. It has the tool for phase 0 and needs tool k for phase k + 1.
 LAST_PHASE = PHASES - 1
 NO_TOOL = -1  # an empty place in the queue of staged tools
 
@@ -90,16 +90,18 @@ class Warehouse(MacroVectorEnv):
     - H+1: Get-Tool. The robot goes to its own place at the table and waits there for a tool, for 10 steps at most.
 
     A robot moves `robot_speed` a step, straight to the waypoint of its macro-action. The last step is shorter, so that
-    the robot ends exactly on the waypoint. The first step of waiting is the one after the robot's arrival. If the robot
-    was not under way in the step before its arrival (its way took a single step, or none), the step of its arrival
-    already counts as waiting.
+    the robot ends exactly on the waypoint. When does its waiting at the table begin? If its way took two steps or more,
+    it begins in the step after the arrival. If its way took one step, or none, it begins in the first step of Get-Tool.
+    So a Get-Tool in vain lasts 3 + 10 steps if the way takes 3 steps, and 10 steps if it takes 1. If a robot that has
+    waited in vain chooses Get-Tool again at once, it waits for 9 more steps, not for 10.
 
     The arm has 1 + R + 3 macro-actions:
 
     - 0: Wait-M takes 1 step and does nothing.
     - 1..R: Pass-to-M(j) takes 4 steps. At its end robot j gets the oldest staged tool, and the robot's Get-Tool ends.
-      If nothing is staged, the Get-Tool ends all the same. The Pass fails if robot j is not waiting at the table when
-      the Pass begins or when it ends. A Pass that fails takes its 4 steps, too, and is penalised at their end.
+      If nothing is staged, the Get-Tool ends all the same. Robot j has to wait at the table in the first and in the
+      last step of the Pass, both looked at after the robots have moved, or the Pass fails. A Pass that fails takes its
+      4 steps, too, and is penalised at their end.
     - R+1..R+3: Search-Tool(k) takes 6 steps. At its end a copy of tool k is staged if not all of its copies have been
       found and there is room for one more tool.
 
@@ -142,8 +144,8 @@ class Warehouse(MacroVectorEnv):
     Then for the arm 14 + R numbers:
 
     - (3) how many of each tool are staged; a tool that is being passed counts until the Pass ends
-    - (3) the tool in its hand, one-hot: the oldest staged one while a Pass is running whose robot was waiting when it
-      began, zeros otherwise
+    - (3) the tool in its hand, one-hot: during a Pass that began with its robot waiting, the oldest staged tool; zeros
+      otherwise
     - (3) how many of each tool have been found so far
     - (1) steps left of its macro-action / length of its longest macro-action
     - (4 + R) its running macro-action, one-hot, zeros when none is running
@@ -184,31 +186,31 @@ class Warehouse(MacroVectorEnv):
 
     - position float64 [N, R, (x, y)]
     - location int [N, R], the number of the place that the robot has reached last
-    - under_way bool [N, R], whether the robot did not reach its waypoint in the last step
+    - under_way bool [N, R], whether the robot was still short of its waypoint after the last step
     - waited int [N, R], for how many steps the robot has waited at the table. The count is set to 0 when a Pass serves
-      the robot and in each step in which the robot is under way. It is set to 1 when a Get-Tool has waited in vain and
-      ends: if the robot chooses Get-Tool again, that step counts as the first one of the new wait.
+      the robot and in each step in which the robot is under way. It is set to 1 when a Get-Tool ends in vain, because
+      its last step also counts as the first one of a next wait.
     - carried int [N, R, 3], copies of each tool
     - staged int [N, C], queue of tools, oldest first, -1 for an empty place
     - found int [N, 3], copies of each tool found so far
     - arm_left int [N], steps left of the arm's macro-action
-    - pass_ready bool [N], about the macro-action that the arm runs or ran last: whether it is a Pass whose robot was
-      waiting when it began
+    - pass_ready bool [N], True from the start of a Pass whose robot was waiting then until the arm starts its next
+      macro-action
     - phase int [N, H], 0..3
     - clock int [N, H], steps left of the phase. It is 0 or less while the human waits for its tool and when it has
       finished the fourth phase.
     - has_next_tool bool [N, H], whether the human has the tool for its next phase (always True in the fourth phase)
 
     ## Irregularities of the published code that are not kept
-    The paper on asynchronous value factorization (see Source) states one rule for all layouts. In the published code
+    The paper of AVF (see Source) states one rule for all layouts. In the published code
     for "s" Get-Tool waits 11 steps and a delivery counts as late one step later. In the published code for "t1" the arm
     does not check robot 2 at the start of a Pass.
 
     ## Source
     Y. Xiao, J. Hoffman, T. Xia, C. Amato, "Learning Multi-Robot Decentralized Macro-Action-Based Policies via a
     Centralized Q-Net", ICRA 2020; Y. Xiao, W. Tan, C. Amato, "Asynchronous Actor-Critic for Multi-Agent Reinforcement
-    Learning", NeurIPS 2022. Variants, rewards and constants are those of Appendix D of the asynchronous value
-    factorization paper.
+    Learning", NeurIPS 2022. Variants, rewards and constants are those of Appendix D of the paper of AVF,
+    "Value Factorization for Asynchronous Multi-Agent Reinforcement Learning".
     """
 
     sim_arrays = (
@@ -254,7 +256,7 @@ class Warehouse(MacroVectorEnv):
         staging_capacity=2,
     ):
         """Raises ValueError: the layout is unknown, or an argument is out of range or does not fit the others."""
-        if layout not in list(LAYOUTS):  # a list, because the argument may have no hash
+        if layout not in list(LAYOUTS):  # a list: an argument without a hash would make a dict raise TypeError
             raise ValueError(f"unknown layout {layout!r}; valid layouts: {' '.join(LAYOUTS)}")
 
         self.layout = layout
@@ -391,6 +393,7 @@ class Warehouse(MacroVectorEnv):
         if self.primitive:
             ended[:] = True
 
+        # In the third phase with the tool for the fourth, or in the fourth, where has_next_tool is always True.
         has_last_tool = (self.phase >= LAST_PHASE - 1) & self.has_next_tool  # [N, H]
         all_supplied = has_last_tool.all(axis=1)
         self._advance_humans()
@@ -424,7 +427,7 @@ class Warehouse(MacroVectorEnv):
         self.waited[under_way] = 0
         self.under_way = under_way
         gives_up = waits & (self.waited >= self.tool_wait_steps)
-        self.waited[gives_up] = 1  # this step counts as the first one of a new wait
+        self.waited[gives_up] = 1  # this step also counts as the first one of a next wait
         return gives_up
 
     def _deliver(self, arrived, destination):
@@ -436,7 +439,7 @@ class Warehouse(MacroVectorEnv):
             carries = np.take_along_axis(self.carried[:, robot], needed, axis=1) > 0  # [N, H]
             delivers = visits[:, robot] & carries & ~self.has_next_tool
             env, human = np.nonzero(delivers)
-            self.carried[env, robot, needed[env, human]] -= 1
+            self.carried[env, robot, needed[env, human]] -= 1  # a robot visits one workshop, so no env occurs twice
             self.has_next_tool |= delivers
             receives |= delivers
         late = self.clock <= 0
