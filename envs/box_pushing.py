@@ -30,7 +30,8 @@ PUSH, TURN_LEFT, TURN_RIGHT, STAY = 4, 5, 6, 7
 PRIMITIVE_NAMES = ["Forward", "Turn-left", "Turn-right", "Stay"]
 PRIMITIVE_TO_MACRO = np.array([PUSH, TURN_LEFT, TURN_RIGHT, STAY])
 
-# Go-to chooses its next cell by costs (no rewards). That of 0 to 3 quarter turns to the right; three are one to the left.
+# Go-to chooses its next cell by costs, which are no rewards. These are the costs of 0 to 3 quarter turns to the right,
+# of which three are one to the left.
 TURN_COST = np.array([0.0, 0.1, 0.2, 0.1])
 SMALL, BIG = slice(0, 2), 2  # boxes 0 and 1 are small, box 2 is big
 
@@ -75,8 +76,8 @@ class BoxPushing(MacroVectorEnv):
     - 5 Turn-left, 6 Turn-right, 7 Stay: they last one step.
 
     With `primitive=True` the actions are 0 Forward, 1 Turn-left, 2 Turn-right and 3 Stay, one step each. Forward is one
-    step of Push. A joint push lasts one step: the big box moves one cell if one agent stands below its left half and the other one below its right
-    half, and both face north and move Forward in the same step.
+    step of Push. A joint push lasts one step: the big box moves one cell if one agent stands below its left half and
+    the other one below its right half, and both face north and move Forward in the same step.
 
     ## Macro-observations
     Five bits say what is in the cell in front of the agent: a small box, the big box, nothing, the boundary, the
