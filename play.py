@@ -22,7 +22,6 @@ import torch
 from PIL import Image
 
 import envs
-import timeline
 from envs import rendering
 
 SCRIPTS = ("avf_vdn", "avf_qmix", "avf_qplex", "dec_maddrqn", "cen_maddrqn", "mac_iaicc")
@@ -43,6 +42,37 @@ class Step(NamedTuple):
     next_infos: dict
 
 
+class Bar(NamedTuple):
+    """A macro-action of an agent."""
+
+    start: int  # times
+    end: int
+    action: int
+
+
+class Episode(NamedTuple):
+    """T steps of n agents. Step t leads from time t to time t + 1; macro-actions start and end at times."""
+
+    labels: list  # [n], what the agents are called
+    names: list  # [n][A], the names of the macro-actions
+    chosen: np.ndarray  # bool [T, n], the agent started a macro-action at time t
+    running: np.ndarray  # int64 [T, n], its macro-action in step t
+    rewards: np.ndarray  # float64 [T]
+    utilities: np.ndarray | None  # float32 [T, n, A], what its network said at time t, -inf for what it cannot start
+    meaning: str  # of the utilities: "utility" or "probability"
+
+    def rows(self):
+        """The decision rows: times at which at least one agent started a macro-action."""
+        return np.flatnonzero(self.chosen.any(1)).tolist()
+
+    def bars(self, agent):
+        """The agent's macro-actions in their order."""
+        starts = np.flatnonzero(self.chosen[:, agent]).tolist()
+        ends = [*starts[1:], len(self.chosen)]
+        actions = self.running[starts, agent].tolist()
+        return [Bar(*bar) for bar in zip(starts, ends, actions, strict=True)]
+
+
 class Recorder:
     """Behaves as the batch of environments it is given and records the first episode of environment 0.
 
@@ -58,7 +88,8 @@ class Recorder:
 
     def listen(self, module, inputs, output):
         """A forward hook for the agents' networks, which run before each step."""
-        self.said = output[0][:, 0].detach()  # [n, A], of environment 0
+        values = output[0]  # [n, N, 1, A], or [N, 1, J] of one network for the whole team
+        self.said = values[:, 0, 0].detach() if values.dim() == 4 else None  # [n, A], of environment 0
 
     def reset(self, **options):
         obs, infos = self.env.reset(**options)
@@ -81,18 +112,19 @@ class Recorder:
         return self.before
 
     def episode(self):
-        """The timeline.Episode up to now, without utilities if one network speaks for the whole team."""
+        """The Episode up to now, without utilities if one network speaks for the whole team."""
         chosen = np.concatenate([step.infos["macro_done"] for step in self.steps])  # [T, n]
         running = np.concatenate([step.next_infos["macro_action"] for step in self.steps])  # [T, n]
         rewards = np.concatenate([step.rewards for step in self.steps])  # [T]
         utilities, said = None, [step.said for step in self.steps]
-        if all(one is not None and len(one) == self.n_agents for one in said):
-            utilities = torch.stack(said)  # [T, n, A]
+        if all(one is not None for one in said):
+            available = np.concatenate([step.infos["available"] for step in self.steps])  # [T, n, A]
+            utilities = torch.stack(said).masked_fill(~torch.from_numpy(available), -torch.inf)
             utilities = (utilities.softmax(2) if self.probabilities else utilities).numpy()
         robots = getattr(self.env, "n_robots", self.n_agents)  # the warehouse's last agent is the arm
         labels = [agent if agent < robots else rendering.ARM for agent in range(self.n_agents)]
         meaning = "probability" if self.probabilities else "utility"
-        return timeline.Episode(labels, self.macro_action_names, chosen, running, rewards, utilities, meaning)
+        return Episode(labels, self.macro_action_names, chosen, running, rewards, utilities, meaning)
 
 
 def watch(script, args, learner, episodes, seed, frames=None):
@@ -109,16 +141,15 @@ def watch(script, args, learner, episodes, seed, frames=None):
 
 # ---- its rows -------------------------------------------------------------------------------------------------------
 def remember(script, args, steps):
-    """The script's replay buffer after its training loop has put an episode of Steps into it, and nothing else."""
-    buffer = getattr(script, "ReplayBuffer", None) or script.EpisodeBuffer
-    buffer = buffer(envs.make(args.env), 1)
-    gamma = args.gamma if args.discount == "step" else 1.0
+    """The rows of an ended episode of Steps as the script's training loop and replay buffer make them, an array [T]."""
+    env = envs.make(args.env)
+    buffer = script.ReplayBuffer(env, 1) if hasattr(script, "ReplayBuffer") else script.EpisodeBuffer(env)
     for step in steps:
-        state = [step.infos["state"]] if hasattr(buffer, "state") else []  # only mixers need it
-        buffer.add(step.obs, step.next_infos["macro_action"], step.infos["macro_done"], *state)
-        discounts = gamma * ~step.terminated
-        buffer.step(*state, args.reward_scale * step.rewards, discounts, step.over, step.next_obs, step.next_infos)
-    return buffer
+        buffer.begin_rows(step.obs, step.infos, step.next_infos["macro_action"], step.infos["macro_done"])
+        state = [step.infos["state"]] if "state" in buffer.running.dtype.names else []  # only mixers need it
+        buffer.add_step(*state, args.reward_scale * step.rewards, np.where(step.terminated, 0.0, args.gamma))
+    buffer.end_episodes(step.over, step.next_obs, step.next_infos)
+    return buffer.ended[0]
 
 
 def describe_rows(script, args, recorder, first, last):
@@ -128,16 +159,15 @@ def describe_rows(script, args, recorder, first, last):
     Raises:
         ValueError: the episode has no such rows.
     """
-    buffer, episode = remember(script, args, recorder.steps), recorder.episode()
-    times, place = [*episode.rows(), len(episode.rewards)], buffer.queue[-1]
+    rows, episode = remember(script, args, recorder.steps), recorder.episode()
+    times = [*episode.rows(), len(episode.rewards)]
     if last >= len(times):
         raise ValueError(f"the episode has rows 0 to {len(times) - 1}")
-    row_gamma = args.gamma if args.discount == "decision" else 1.0
     wide = max(len(name) for names in episode.names for name in names)
     lines = [
         "since: the row at which the agent chose its macro-action; if it is an earlier one, the agent is ongoing here",
         f"r: rewards until the next row, discounted and summed, times --reward-scale {args.reward_scale:g}",
-        f"discount: {'gamma^tau' if args.discount == 'step' else 'gamma'} of the next row's value, 0 at a terminal end",
+        "discount: gamma^tau of the next row's value, 0 at a terminal end",
         "",
         f"{'row':>4}{'t':>5}{'tau':>5}{'r':>10}{'discount':>10} | {'agent':6}{'runs':{wide + 2}}{'since':>5}"
         f"  {'here':9}last saw",
@@ -145,13 +175,13 @@ def describe_rows(script, args, recorder, first, last):
     for row in range(first, last + 1):
         final = row == len(times) - 1
         tau = "end" if final else times[row + 1] - times[row]
-        reward, discount = buffer.reward[place, row], row_gamma * buffer.discount[place, row]
-        left = f"{row:4}{times[row]:5}{tau:>5}" + ("" if final else f"{reward:10.4f}{discount:10.4f}")
+        left = f"{row:4}{times[row]:5}{tau:>5}"
+        left += "" if final else f"{rows['reward'][row]:10.4f}{rows['discount'][row]:10.4f}"
         for agent, label in enumerate(episode.labels):
-            since, action = buffer.since[place, row, agent], buffer.action[place, row, agent]
+            since, action = rows["since"][row, agent], rows["action"][row, agent]
             name = "-" if final else episode.names[agent][action]
             here = "free" if final else "chosen" if since == row else "ongoing"
-            saw = buffer.obs[place, row, agent, : recorder.obs_sizes[agent]]
+            saw = rows["obs"][row, agent, : recorder.obs_sizes[agent]]
             saw = " ".join(f"{round(float(x), 2) + 0.0:g}" for x in saw)  # + 0.0: not -0
             line = f"{left:34} | {label:<6}{name:{wide + 2}}{since:5}  {here:9}{saw}"
             lines.append(line if len(line) <= COLUMNS else line[: COLUMNS - 4] + " ...")
@@ -188,15 +218,15 @@ def load_run(folder, name):
     return script, args, learner, model["step"]
 
 
-def write(path, picture, kind, **options):
-    """Writes a picture beside the file and swaps, so that a failure leaves the file that was there."""
+def write(path, save):
+    """Lets `save` write a file beside the path and swaps, so that a failure leaves the file that was there."""
     new = Path(f"{path}.new")
     try:
-        picture.save(new, kind, **options)
+        save(new)
         os.replace(new, path)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a timeline is too high for a PNG
         new.unlink(missing_ok=True)
-        fail(f"cannot write {path}: {error.strerror or error}")
+        fail(f"cannot write {path}: {getattr(error, 'strerror', None) or error}")
 
 
 def span(words):
@@ -214,7 +244,7 @@ def parse_args(argv=None):
     parser.add_argument("--model", choices=("best", "last"), default="best", help="of which evaluation (default: best)")
     parser.add_argument("--seed", type=int, help="of the episodes, from 0 on (default: that of the run)")
     parser.add_argument("--gif", metavar="FILE", help="write an animation of the first episode")
-    parser.add_argument("--timeline", metavar="FILE", help="write a picture of its macro-actions and rows, a PNG")
+    parser.add_argument("--timeline", metavar="FILE", help="draw its macro-actions and rows, as .png, .svg or .pdf")
     parser.add_argument("--rows", metavar="A-B", help="print its rows A to B as the replay buffer holds them")
     parser.add_argument("--steps", metavar="A-B", help="with --timeline: only time A to B, enlarged, with utilities")
     options = parser.parse_args(argv)
@@ -222,9 +252,9 @@ def parse_args(argv=None):
         fail(f"--episodes must be at least 1, got {options.episodes}")
     if options.seed is not None and options.seed < 0:
         fail(f"--seed must not be negative, got {options.seed}")
-    for kind, path in ((".gif", options.gif), (".png", options.timeline)):
-        if path is not None and (Path(path).suffix.lower() != kind or not Path(path).parent.is_dir()):
-            fail(f"cannot write {path}: it has to be a {kind} file in a folder that exists")
+    for path, kinds in ((options.gif, [".gif"]), (options.timeline, [".png", ".svg", ".pdf"])):
+        if path is not None and (Path(path).suffix.lower() not in kinds or not Path(path).parent.is_dir()):
+            fail(f"cannot write {path}: it has to be a {' or '.join(kinds)} file in a folder that exists")
     if options.steps is not None:
         if not options.timeline:
             fail("--steps needs --timeline")
@@ -262,12 +292,16 @@ def main(argv=None):
     if options.gif:
         pictures = [Image.fromarray(frame).quantize(dither=0) for frame in frames]
         times = [150] * (len(frames) - 1) + [1500]  # milliseconds
-        write(options.gif, pictures[0], "GIF", save_all=True, append_images=pictures[1:], duration=times, loop=0)
+        animation = {"save_all": True, "append_images": pictures[1:], "duration": times, "loop": 0}
+        write(options.gif, lambda file: pictures[0].save(file, "GIF", **animation))
     if options.timeline:
+        import timeline  # here, since it takes a while to import matplotlib
+
         facts = f"A greedy episode of {length} steps, {len(episode.rows())} of them rows: "
         facts += f"return {result['return'][0]:.4g}{', success' * bool(result['success'][0])}"
-        picture = Image.fromarray(timeline.draw(episode, name.replace(" ", ", "), facts, options.steps))
-        write(options.timeline, picture.quantize(256, Image.Quantize.MAXCOVERAGE), "PNG", optimize=True)
+        figure = timeline.draw(episode, name.replace(" ", ", "), facts, options.steps)
+        kind = Path(options.timeline).suffix.lower().removeprefix(".")
+        write(options.timeline, lambda file: timeline.save(figure, file, kind))
 
 
 if __name__ == "__main__":

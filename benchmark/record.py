@@ -58,7 +58,7 @@ def checksum(algorithm, env):
     So a value of Args or DEFAULTS that is changed leaves the recorded runs of tasks that have another what they are.
     """
     values = asdict(load_script(algorithm).parse_args([f"--env={env}"]))
-    field = rf"^(    (?:{'|'.join(values)}): .+?) = .*?(?=  # )"  # of Args, no other annotated name
+    field = rf"^(    (?:{'|'.join(values)}): .+?) = (?s:.*?)(?=  # )"  # of Args, no other annotated name
     script = re.sub(field, r"\1", (ROOT / f"{algorithm}.py").read_text(), flags=re.M)
     script = re.sub(r"^DEFAULTS = \{.*?^\}", repr(values), script, flags=re.S | re.M)
     code = [script.encode(), *(path.read_bytes() for path in sorted((ROOT / "envs").glob("*.py")))]

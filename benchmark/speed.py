@@ -7,10 +7,11 @@
     act      a script's choice for one environment
     env      a step of one environment, with random macro-actions; resets included
     update   a gradient update: training less training without updates; of Mac-IAICC, an environment step's share
-    train    an environment step of training that updates as often as by default, less the start of the program
+    train    an environment step of training that updates as often as by default, without the start of the program
 
 CPU milliseconds of one thread, the median of several rounds. Training goes through the command line, so the other
-checkout may be of any age; what takes little of a run, such as the updates of Mac-IAICC, needs more --steps.
+checkout may be of any age. A run plays one episode in each environment first, so that there is something to learn
+from, and then takes --steps. What takes little of a run, such as the updates of Mac-IAICC, needs more of them.
 
 With --scaling, every measure is taken in a process of its own, with a full replay buffer: env and act as above in
 microseconds, update in milliseconds (one thread, medians), then the weights of the mixer in thousands, the replay
@@ -51,26 +52,32 @@ SCALING = {  # what grows, over which values
 
 def play(script, args, env, agents, steps, buffer=None):
     """Seconds of each choice and of each step, resets included, of a batch of environments, float64 [2, steps].
-    args: the script's. buffer: a replay buffer that records what is played, or None."""
-    rng, seconds = np.random.default_rng(0), np.zeros((2, steps))
-    (obs, infos), hidden = env.reset(seed=0), agents.start(env.num_envs)
+
+    args: the script's. buffer: a replay buffer that records what is played, or None.
+    """
+    rng = np.random.default_rng(0)
+    seconds = np.zeros((2, steps))
+    obs, infos = env.reset(seed=0)
+    hidden = agents.start(env.num_envs)
     for i in range(steps):
-        states = (infos["state"],) if hasattr(args, "mixer_state") else ()  # only mixers see it
         start = time.process_time()
         actions, hidden = script.act(agents, obs, infos, hidden, 1.0, rng)
         seconds[0, i] = time.process_time() - start
         if buffer:
-            buffer.add(obs, actions, infos["macro_done"], *states)
+            buffer.begin_rows(obs, infos, actions, infos["macro_done"])
+        state = [infos["state"]] if hasattr(args, "mixer_state") else []  # only mixers see it
         start = time.process_time()
         obs, rewards, terminations, truncations, infos = env.step(actions)
         seconds[1, i] = time.process_time() - start
-        over = terminations | truncations
         if buffer:
-            buffer.step(*states, rewards, args.gamma * ~terminations, over, obs, infos)
-        start = time.process_time()
+            buffer.add_step(*state, rewards, np.where(terminations, 0.0, args.gamma))
+        over = terminations | truncations
         if over.any():
+            if buffer:
+                buffer.end_episodes(over, obs, infos)
+            start = time.process_time()
             obs, infos = env.reset(options={"reset_mask": over})
-        seconds[1, i] += time.process_time() - start
+            seconds[1, i] += time.process_time() - start
     return seconds
 
 
@@ -89,54 +96,70 @@ def run(checkout, name, flags):
 
 def training(checkouts, name, args, steps, rounds):
     """Seconds of an update and of a step of training, by measure: float64 [rounds, checkouts]. args: the script's."""
-    common = {"env": args.env, "num-envs": args.num_envs, "total-timesteps": steps, "eval-episodes": 1}
+    first = envs.make(args.env).horizon * args.num_envs  # steps after which an episode has ended everywhere
+    total = first + -(-steps // args.num_envs) * args.num_envs
+    common = {"env": args.env, "num-envs": args.num_envs, "total-timesteps": total, "eval-episodes": 1}
     common |= {"eval-frequency": 10**9, "checkpoint-frequency": 10**9}
     if hasattr(args, "train_frequency"):
-        updates, common["train-frequency"] = steps // args.train_frequency, args.train_frequency
-        idle, learning = {"learning-starts": steps}, {"learning-starts": 0}
+        common["train-frequency"] = args.train_frequency
+        idle, learning = {"learning-starts": total}, {"learning-starts": first}
+        updates = total // args.train_frequency - first // args.train_frequency
+        updates_per_step = 1 / args.train_frequency
     else:  # an actor-critic learns from every batch of episodes: it does not where the batch is never full
-        updates, idle, learning = steps, {"batch-size": steps}, {}
+        idle, learning = {"batch-size": total}, {}
+        updates = total
+        updates_per_step = 1
+    if not updates:
+        sys.exit(f"speed: {name} makes no update in {steps} steps on {args.env}: give it more --steps")
     runs = common | {"total-timesteps": 1}, common | idle, common | learning
     seconds = [[[run(checkout, name, flags) for checkout in checkouts] for flags in runs] for _ in range(rounds)]
-    begin, without, total = np.moveaxis(seconds, 1, 0)
-    return {"update": (total - without) / updates, "train": (total - begin) / steps}
+    begin, without, whole = np.moveaxis(seconds, 1, 0)
+    update = (whole - without) / updates
+    return {"update": update, "train": (without - begin) / total + updates_per_step * update}
 
 
 def scale(name, mixer_state, size, updates):
     """The numbers of --scaling, six floats, of a script on Capture Target of a size, to be run in a process of its own.
-    mixer_state: None for a script without a mixer. size: as SIZE. updates: how many are timed."""
+
+    mixer_state: None for a script without a mixer. size: as SIZE. updates: how many are timed.
+    """
     torch.set_num_threads(1)
     script, env_id = record.load_script(name), "ct-" + "-".join(str(size[key]) for key in ("agents", "grid", "horizon"))
     if envs.problem(env_id):
         envs.register(env_id, CaptureTarget, n_agents=size["agents"], grid=size["grid"], horizon=size["horizon"])
-    state = {"mixer_state": mixer_state} if mixer_state else {}
-    args = script.parse_args([f"--env={env_id}", *(f"--mixer-state={each}" for each in state.values())])
-    env, rng = envs.make(env_id, size["envs"]), np.random.default_rng(0)
-    learner, buffer = script.make_learner(args, env), script.ReplayBuffer(env, args.buffer_size)
-    memory = [x for key, x in vars(buffer).items() if key not in ("rows", "queue", "writing")]
-    for array in memory:
-        array.fill(0)  # a full buffer: what is not written to takes no memory
+    args = script.parse_args([f"--env={env_id}", *([f"--mixer-state={mixer_state}"] if mixer_state else [])])
+    env = envs.make(env_id, size["envs"])
+    rng = np.random.default_rng(0)
+    learner = script.make_learner(args, env)
+    buffer = script.ReplayBuffer(env, args.buffer_size)
     playing = play(script, args, env, learner["agents"], env.horizon, buffer)
+    for episode in itertools.cycle(list(buffer.ended)):  # the same ones again, until the buffer is full
+        if len(buffer.ended) == args.buffer_size:
+            break
+        buffer.ended.append(episode.copy())
+    target = copy.deepcopy(learner).requires_grad_(False)
+    optimizer = torch.optim.Adam(learner.parameters(), fused=True)
+    mixers = [part["mixer"] for part in (learner, target)] if mixer_state else []
     learning = []
-    target, fast = copy.deepcopy(learner).requires_grad_(False), list(learner.parameters())
-    optimizer, slow = torch.optim.Adam(fast, fused=True), list(target.parameters())
-    mixers = [part["mixer"] for part in (learner, target)] if state else []
     for _ in range(updates):  # as in `train` of the script
         start = time.process_time()
-        batch = buffer.sample(args.batch_size, args.window, *state.values(), rng)
-        utilities = script.over_rows(batch, learner["agents"], target["agents"])
-        loss, _, _ = script.td_loss(*utilities, *mixers, batch, args.td_lambda, args.hysteresis)
+        batch = script.make_batch(buffer.sample(args.batch_size, rng))
+        utilities = script.utilities_at_rows(learner["agents"], batch)
+        target_utilities = script.utilities_at_rows(target["agents"], batch)
+        loss, _, _ = script.td_loss(utilities, target_utilities, *mixers, batch, args)
         optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(fast, args.max_grad_norm)
+        torch.nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
         optimizer.step()
-        torch.optim.swa_utils.get_ema_multi_avg_fn(args.polyak)(slow, fast, None)
+        for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
+            slow.lerp_(fast.detach(), 1 - args.polyak)
         learning.append(time.process_time() - start)
-    weights = sum(x.numel() for x in mixers[0].parameters()) if state else 0
+    weights = sum(x.numel() for x in mixers[0].parameters()) if mixers else 0
+    replay = buffer.running.nbytes + sum(episode.nbytes for episode in buffer.ended)
     unit = 2**10 if sys.platform == "linux" else 1  # of ru_maxrss, in bytes
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
     act, step = 1e6 * np.median(playing, axis=1) / env.num_envs
-    return step, act, 1e3 * np.median(learning), weights / 1e3, sum(x.nbytes for x in memory) / 1e6, peak
+    return step, act, 1e3 * np.median(learning), weights / 1e3, replay / 1e6, peak
 
 
 def print_scaling(updates):
@@ -160,7 +183,7 @@ def main(argv=None):
     add("--scripts", nargs="+", default=record.scripts(), choices=record.scripts(), metavar="NAME", help="default: all")
     add("--envs", nargs="+", default=tasks, choices=envs.IDS, metavar="ID", help=f"default: {' '.join(tasks)}")
     add("--num-envs", type=int, help="environments side by side (default: the script's)")
-    add("--steps", type=int, default=10_000, help="environment steps of a training run (default: %(default)s)")
+    add("--steps", type=int, default=10_000, help="of a training run after its first episodes (default: %(default)s)")
     add("--rounds", type=int, default=3, help="default: %(default)s")
     add("--against", metavar="FOLDER", type=Path, help="another checkout to compare with")
     add("--scaling", action="store_true", help="tables of cost and memory by size instead; goes with --rounds alone")

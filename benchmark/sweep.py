@@ -4,10 +4,11 @@
     python benchmark/sweep.py --algos avf_qmix --envs wtd-s --seeds 1-3 --record -- --mixer-state single
 
 What follows -- goes to every script. Finished runs are skipped, others go on from their checkpoint, a crashed one is
-tried once more. Ctrl-C, SIGTERM and, on Linux, even the death of this program make the scripts write a checkpoint and
-end; the same command goes on. A run is the same if algorithm, task, flags, seed and code are. With --record finished
-runs are added to runs.csv and evaluations.csv, and what is in there is skipped. With --engine ray each run is a Ray
-task of one CPU, whose nodes must have this repository and the runs folder under the same paths.
+tried once more. Ctrl-C, SIGTERM and, on Linux, even the death of this program end the scripts, too. The same command
+then goes on from their checkpoints, so each run loses a minute at most. A run is the same if algorithm, task, flags,
+seed and code are. With --record finished runs are added to runs.csv and evaluations.csv, and what is in there is
+skipped. With --engine ray each run is a Ray task of one CPU, whose nodes must have this repository and the runs folder
+under the same paths.
 """
 
 import argparse
@@ -39,20 +40,15 @@ LOST_WORKERS = 10  # times that a run is moved to another Ray worker
 LOG = "log.txt"
 LOCK_SECONDS = 120  # to wait for another process to leave a run; NFS needs 90 to give up the locks of a lost machine
 
-# The signals to pass on to the scripts: those this program received, or in a Ray worker the cancellations of its task.
+# The signals that this program received, or in a Ray worker the cancellations of its task: the first one ends scripts.
 stop = []
 
-# On Linux a script's guard dies with the process that started it, and the script gets SIGTERM when its guard dies. Not
-# directly: a dying process sends one for each of its threads, and a second one may mean to end at once.
-GUARD = """import ctypes, os, signal, subprocess, sys
-prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else lambda option, number: None
-prctl(1, signal.SIGKILL)
+# What runs a script: on Linux it is killed when the process that started it dies (PR_SET_PDEATHSIG), even by SIGKILL
+LAUNCHER = """import ctypes, os, signal, sys
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 if os.getppid() == int(sys.argv[1]):
-    script = subprocess.Popen([sys.executable, *sys.argv[2:]], preexec_fn=lambda: prctl(1, signal.SIGTERM))
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: script.send_signal(number))
-    code = script.wait()
-    sys.exit(code if code >= 0 else 128 - code)"""
+    os.execv(sys.executable, [sys.executable, *sys.argv[2:]])"""
 
 
 # A job is a dict: the KEY of a run (see record.py), also as a tuple, key, and in words, name; variant; options, the
@@ -85,6 +81,11 @@ def lock(log):
     return True
 
 
+def was_stopped(code):
+    """Whether a script's exit code, as of subprocess, None before the first one, is that of Ctrl-C or of a signal."""
+    return code is not None and (code < 0 or code == 128 + signal.SIGINT)
+
+
 def run_job(job):
     """Runs a job to its end, from its checkpoint if there is one, and returns it as it ended; also in a Ray task."""
     started, attempts, code, error, folder, result = time.time(), 0, None, "", None, None
@@ -97,7 +98,7 @@ def run_job(job):
             folder, finished = find_run(job)
             if finished:
                 result = "finished" if attempts else "skipped"
-            elif stop or code in (128 + signal.SIGINT, 128 + signal.SIGTERM):
+            elif stop or was_stopped(code):
                 result = "stopped"
             elif record.checksum(job["algorithm"], job["env"]) != job["checksum"]:
                 result, error = "failed", "the code was changed since the sweep began"
@@ -114,23 +115,22 @@ def run_job(job):
 
 
 def run_script(job, folder, log):
-    """Runs a job's script, or goes on with a run folder, passes the signals in `stop` on, returns its exit code."""
+    """Runs a job's script, or goes on with a run folder, until it ends or `stop` has a signal; returns its exit code."""
     new = [f"--env={job['env']}", f"--seed={job['seed']}", f"--runs-dir={job['place']}", *job["options"]]
     command = [str(record.ROOT / f"{job['algorithm']}.py"), *([f"--resume={folder}"] if folder else new)]
     print(time.strftime("=== %F %T"), os.uname().nodename, shlex.join(command), file=log, flush=True)
     origin = {name: job[name] for name in ("flags", "variant", "checksum")}
     origin |= {"commit": record.commit(), "processor": record.processor()}
     record.replace_text(Path(job["place"]) / record.ORIGIN, json.dumps(origin, indent=2) + "\n")
-    # In a process group of its own: Ctrl-C would reach it from the terminal, too, and the scripts want it once
+    # In a process group of its own, which Ctrl-C in a terminal does not reach: the sweep decides how a script ends
     options = dict(stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    guarded = [sys.executable, "-c", GUARD, str(os.getpid()), *command]
-    process = subprocess.Popen(guarded, process_group=0, **options)
-    code, passed = None, 0
+    launched = [sys.executable, "-c", LAUNCHER, str(os.getpid()), *command]
+    process = subprocess.Popen(launched, process_group=0, **options)
+    code = None
     while code is None:
         try:
-            for number in stop[passed:]:
-                process.send_signal(number)
-                passed += 1
+            if stop:
+                process.terminate()
             time.sleep(0.1)
             code = process.poll()
         except KeyboardInterrupt:  # how Ray cancels a task
@@ -268,11 +268,11 @@ def main(argv=None):
     columns = ["algorithm", "env", "seed", "result", "return", "time", "attempts", "folder"]
     print(pd.DataFrame(jobs)[columns].to_string(index=False))
     for job in jobs:
-        if job["result"] == "failed":
-            print(f"{job['name']} failed: {job['error']} (log: {Path(job['place']) / LOG})")
+        if job["result"] == "failed" or (job["result"] == "stopped" and not stop):  # by whom, if not by the sweep?
+            print(f"{job['name']} {job['result']}: {job['error']} (log: {Path(job['place']) / LOG})")
     if stop:
         command = shlex.join([sys.argv[0], *argv])
-        print(f"sweep: stopped, nothing is lost; go on with: python {command}", file=sys.stderr)
+        print(f"sweep: stopped; go on from the last checkpoints with: python {command}", file=sys.stderr)
         return 128 + stop[0]
     return 0 if all(job["result"] in ("recorded", "skipped", "finished") for job in jobs) else 1
 

@@ -5,6 +5,7 @@ python docs/how_it_works.py
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ sys.path.insert(0, str(DOCS.parent))
 import play  # noqa: E402
 
 PAGE = DOCS / "how-it-works.md"
+RUNS = DOCS / "models"
 BLOCK = re.compile(r"(<!-- (\w+) -->\n```text\n)(.*?)(```\n)", re.DOTALL)  # (opening, name, text, end)
 MODELS = ("avf_vdn", "avf_qmix", "avf_qplex")
 MIXERS = MODELS[1:]  # those that see a state
@@ -23,31 +25,42 @@ ROW, NEXT = 4, 5  # the page follows the transition from one row to the next
 
 
 class Reader:
-    """What the model of a script says about the rows of an episode, a batch of one from ReplayBuffer.sample.
+    """What the model of a script says about the rows of an episode, a batch of one.
 
-    utilities: float32 [T, n, A]. best: int64 [T, n], the conditional argmax. q, target: float32 [T - 1], of td_loss.
+    utilities: float32 [T, n, A]. best: int64 [T, n], the conditional argmax. q, target: float32 [T - 1], those of
+    td_loss with lambda 0.
     """
 
     def __init__(self, name, batch):
-        self.script, args, learner, self.step = play.load_run(DOCS / "models" / name, "best")
+        self.script, args, learner, self.step = play.load_run(RUNS / name, "best")
         self.result, self.recorder = play.watch(self.script, args, learner, 1, args.seed)
-        self.batch, self.mixer = batch, learner["mixer"] if "mixer" in learner else None
+        self.batch = batch
+        self.mixer = learner["mixer"] if "mixer" in learner else None
+        mixers = [self.mixer, self.mixer] if self.mixer else []  # each network is also its own target network
         with torch.no_grad():
-            utilities = self.script.over_rows(batch, *[learner["agents"]] * 2)  # also as its own target network
-            _, self.q, self.target = self.script.td_loss(*utilities, *[self.mixer] * 2 * bool(self.mixer), batch)
-        self.utilities = utilities[0][0]
-        self.best = torch.where(batch["chosen"][0], self.utilities.argmax(2), batch["action"][0])
+            utilities = self.script.utilities_at_rows(learner["agents"], batch)
+            one_row = replace(args, td_lambda=0.0)
+            _, self.q, self.target = self.script.td_loss(utilities, utilities, *mixers, batch, one_row)
+        self.utilities = utilities[0]
+        self.best = self.utilities.masked_fill(~batch["available"][0], -torch.inf).argmax(2)
 
-    def joint(self, row, actions, state=None):
+    def joint(self, row, actions, states=None):
         """The joint value of macro-actions int64 [n] at a row and its derivatives by their utilities, float32 [n].
-        state: float32 [S], None for the joint macro-state."""
-        taken = self.utilities[row].gather(1, actions[:, None])[:, 0].requires_grad_()
-        if self.mixer is None:
-            value = self.script.mix(taken)
+
+        Busy agents are taken to run these macro-actions, whatever they really run. states: float32 [n, S], None for the
+        macro-states of the row.
+        """
+        utilities = self.utilities[row].clone().requires_grad_()
+        if self.mixer:
+            free = self.batch["free"][0, row, :, None]
+            runs = torch.nn.functional.one_hot(actions, utilities.shape[1]).bool()
+            available = torch.where(free, self.batch["available"][0, row], runs)
+            states = self.batch["macro_state"][0, row] if states is None else states
+            value = self.mixer(utilities, actions, available, states.flatten())
         else:
-            chosen, seen = self.batch["chosen"][0, row], self.batch["state"][0, row] if state is None else state
-            value = self.mixer(taken, self.utilities[row].amax(1), actions, chosen, seen)
-        return value.item(), torch.autograd.grad(value, taken)[0].tolist()
+            value = self.script.mix(utilities, actions)
+        (slopes,) = torch.autograd.grad(value, utilities)
+        return value.item(), slopes.gather(1, actions[:, None])[:, 0].tolist()
 
 
 def table(*lines):
@@ -63,12 +76,12 @@ def table(*lines):
 def make_blocks():
     """The blocks of the page by name."""
     torch.set_num_threads(1)  # fastest for networks of this size
-    script, args, learner, _ = play.load_run(DOCS / "models" / "avf_qplex", "best")
+    script, args, learner, _ = play.load_run(RUNS / "avf_qplex", "best")
     _, recorder = play.watch(script, args, learner, 1, args.seed)
-    episode, buffer = recorder.episode(), play.remember(script, args, recorder.steps)
-    batch = buffer.sample(1, args.window, "joint", np.random.default_rng(0))
+    episode, stored = recorder.episode(), play.remember(script, args, recorder.steps)
+    batch = script.make_batch([stored])
     readers = {name: Reader(name, batch) for name in MODELS}
-    since, states = buffer.since[buffer.queue[-1]], buffer.state[buffer.queue[-1]]  # [T, n], [T, S]
+    since, states = stored["since"], stored["state"]  # [T, n], [T, S]
     agents, times = [f"agent {label}" for label in episode.labels], episode.rows()
 
     def name(agent, action):
@@ -104,16 +117,17 @@ def make_blocks():
     # Where an ongoing agent runs something else than the model would choose now
     other = [("model", "row", "agent", "runs", "its argmax", "Q' with what runs", "Q' with its argmax")]
     for model, reader in readers.items():
-        free = reader.utilities.argmax(2)
-        for row, agent in (~batch["chosen"][0] & (free != reader.best)).nonzero().tolist():
+        own_actions = torch.from_numpy(recorder.own_actions)
+        liked = reader.utilities.masked_fill(~own_actions, -torch.inf).argmax(2)  # [T, n]
+        for row, agent in (~batch["free"][0] & (liked != reader.best)).nonzero().tolist():
             instead = reader.best[row].clone()
-            instead[agent] = free[row, agent]
+            instead[agent] = liked[row, agent]
             values = reader.joint(row, reader.best[row])[0], reader.joint(row, instead)[0]
             runs = name(agent, reader.best[row, agent])
-            other.append((model, row, agents[agent], runs, name(agent, free[row, agent]), *values))
+            other.append((model, row, agents[agent], runs, name(agent, liked[row, agent]), *values))
 
     # What the mixers do with the choices of the agent that chooses, while the others go on
-    (chooser,) = np.flatnonzero(batch["chosen"][0, NEXT])
+    (chooser,) = np.flatnonzero(batch["free"][0, NEXT])
     mix = [("model", f"{agents[chooser]} runs", *(f"Q of {label}" for label in agents), "joint Q'",
             *(f"dQ'/dQ {label[-1]}" for label in agents), "lambda")]  # fmt: skip
     for model, reader in readers.items():
@@ -123,7 +137,8 @@ def make_blocks():
             actions[chooser] = action
             taken = reader.utilities[NEXT].gather(1, actions[:, None])[:, 0].tolist()
             value, derivatives = reader.joint(NEXT, actions)
-            below = slopes[chooser] * (taken[chooser] - reader.utilities[NEXT, chooser].max().item())  # w A
+            best_taken = reader.utilities[NEXT, chooser, reader.best[NEXT, chooser]].item()
+            below = slopes[chooser] * (taken[chooser] - best_taken)  # w A
             attention = (value - top) / below if model == "avf_qplex" and below else ""
             mix.append((model, word, *taken, value, *derivatives, attention))
 
@@ -136,8 +151,8 @@ def make_blocks():
         part.append((label, int(row), times[row], *(" ".join(f"{x:g}" for x in numbers[a:b]) for a, b in spans)))
     fed = [("states of rows", *MIXERS)]
     for rows_fed in (since[NEXT].tolist(), [NEXT] * 3, [ROW] * 3):
-        state = torch.from_numpy(states[rows_fed].ravel())
-        values = (readers[model].joint(NEXT, readers[model].best[NEXT], state)[0] for model in MIXERS)
+        seen = torch.from_numpy(states[rows_fed])  # [n, S]
+        values = (readers[model].joint(NEXT, readers[model].best[NEXT], seen)[0] for model in MIXERS)
         fed.append((", ".join(map(str, rows_fed)), *values))
     fed.append((f"target y of row {NEXT}", *(readers[model].target[NEXT].item() for model in MIXERS)))
 

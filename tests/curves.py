@@ -4,8 +4,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 
 def scalars(folder):
-    """{tag: [(step, value), ...]} of a run folder, without the one that depends on the clock."""
+    """{tag: [(step, value), ...]} of a run folder."""
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
-    tags = sorted(set(events.Tags()["scalars"]) - {"charts/SPS"})
-    return {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in tags}
+    return {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}

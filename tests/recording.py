@@ -21,7 +21,7 @@ def scripted():
         actions = np.full((2, 2), 7)
         if step < 8:
             actions[0] = [left[agent].pop(0) if infos["macro_done"][0, agent] else 3 for agent in range(2)]
-        recorder.listen(None, None, (torch.tensor(said + step).reshape(2, 2, 8), None))
+        recorder.listen(None, None, (torch.tensor(said + step).reshape(2, 2, 1, 8), None))
         _, _, terminations, truncations, infos = recorder.step(actions)
         if (over := terminations | truncations).any():
             _, infos = recorder.reset(options={"reset_mask": over})

@@ -1,85 +1,166 @@
-"""Definitions of one name are the same in every algorithm script that has it, but for the table below.
+"""Definitions of one name are the same in every algorithm script that has it, but for the tables below.
 
     python tests/sync.py                                shows where scripts differ that should not
     python tests/sync.py copy avf_vdn.py evaluate       copies a definition from one script to the others of its group
 
-What can be copied: a top-level function or class, a field of Args (`Args.gamma`) or `Args.__post_init__`, a family's
-row of DEFAULTS (`DEFAULTS.bp`). `train` has a few lines that are the algorithm's own: it is compared line by line, and
-cannot be copied.
+What can be copied: a top-level function or assignment, a class's head with its docstring (`Agents`), a method
+(`Agents.forward`), a field (`Args.gamma`), a row of DEFAULTS (`DEFAULTS.bp-`). `train` is compared without the lines
+that OWN_LINES lists. What stands between definitions is compared as "the rest".
 """
 
 import ast
 import difflib
 import re
 import sys
-from itertools import combinations
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-Q_LEARNING = "avf_vdn avf_qmix avf_qplex dec_maddrqn cen_maddrqn"
+AVF = "avf_vdn avf_qmix avf_qplex"
+WITH_MIXER = "avf_qmix avf_qplex"
+Q_LEARNING = f"{AVF} dec_maddrqn cen_maddrqn"
 SCRIPTS = (*Q_LEARNING.split(), "mac_iaicc")
+OTHER_NAMES = {"EpisodeBuffer": "ReplayBuffer"}  # mac_iaicc.py keeps no old episodes, but its buffer is the same
 
 # Where definitions of one name differ: groups within which they are the same. All others are the same in all scripts.
 GROUPS = {
-    "Agents": ["avf_vdn avf_qmix avf_qplex dec_maddrqn", "mac_iaicc"],  # logits, and a docstring that says so
-    "over_rows": [Q_LEARNING, "mac_iaicc"],  # the same code, a docstring of logits
-    "ReplayBuffer": ["avf_qmix avf_qplex", "avf_vdn dec_maddrqn cen_maddrqn"],  # with states for a mixer, without
-    "td_loss": ["avf_qmix avf_qplex", "avf_vdn", "cen_maddrqn"],  # with a mixer, the sum, the team's own value
-    "own_returns": ["dec_maddrqn", "mac_iaicc"],  # lambda-returns within a window, n-step returns
-    "act": ["avf_vdn avf_qmix avf_qplex dec_maddrqn", "cen_maddrqn", "mac_iaicc"],
+    "AT_MOST_1": [Q_LEARNING, "mac_iaicc"],  # names of settings that the others do not have
+    "Agents": [f"{AVF} dec_maddrqn", "mac_iaicc"],  # utilities, or outputs of actors and of critics
+    "Agents.forward": [f"{AVF} dec_maddrqn", "mac_iaicc"],
+    "ReplayBuffer": [Q_LEARNING, "mac_iaicc"],
+    "ReplayBuffer.__init__": ["avf_vdn dec_maddrqn cen_maddrqn", WITH_MIXER, "mac_iaicc"],  # states are for a mixer
+    "ReplayBuffer.begin_rows": ["avf_vdn dec_maddrqn cen_maddrqn mac_iaicc", WITH_MIXER],
+    "ReplayBuffer.add_step": ["avf_vdn dec_maddrqn cen_maddrqn mac_iaicc", WITH_MIXER],
+    "make_batch": ["avf_vdn dec_maddrqn cen_maddrqn mac_iaicc", WITH_MIXER],
+    "td_loss": ["avf_vdn", WITH_MIXER, "cen_maddrqn"],
+    "own_returns": ["dec_maddrqn", "mac_iaicc"],  # Q(lambda) returns, n-step returns
+    "act": [f"{AVF} dec_maddrqn", "cen_maddrqn", "mac_iaicc"],  # agents, the team, policies
     "make_learner": ["avf_vdn dec_maddrqn", "avf_qmix", "avf_qplex", "cen_maddrqn", "mac_iaicc"],
-    "Args.__post_init__": [Q_LEARNING, "mac_iaicc"],  # names of settings that the others do not have
-    "DEFAULTS.bp": [Q_LEARNING, "mac_iaicc"],
+    "train": ["avf_vdn", WITH_MIXER, "dec_maddrqn", "cen_maddrqn", "mac_iaicc"],  # but for OWN_LINES it is the same
+    "Args.__post_init__": [Q_LEARNING, "mac_iaicc"],
+    "Args.seed": [Q_LEARNING, "mac_iaicc"],  # no replay
+    "Args.num_envs": [Q_LEARNING, "mac_iaicc"],
+    "Args.gamma": [Q_LEARNING, "mac_iaicc"],
+    "Args.batch_size": [Q_LEARNING, "mac_iaicc"],
+    "Args.polyak": [Q_LEARNING, "mac_iaicc"],
+    "Args.exploration_timesteps": [Q_LEARNING, "mac_iaicc"],
+    "Args.end_e": [Q_LEARNING, "mac_iaicc"],
+    "Args.reward_scale": [Q_LEARNING, "mac_iaicc"],
+    "Args.hysteresis": [Q_LEARNING, "mac_iaicc"],
+    "Args.hidden_size": [f"{AVF} dec_maddrqn", "cen_maddrqn", "mac_iaicc"],  # of the agents', one or two networks
+    "DEFAULTS.bp-": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.wtd-t": [Q_LEARNING, "mac_iaicc"],
-    "DEFAULTS.ct": [Q_LEARNING, "mac_iaicc"],
-    "Args.td_lambda": ["avf_vdn avf_qmix avf_qplex", "dec_maddrqn cen_maddrqn"],  # docs/defaults.md, Warehouse
-    **{f"Args.{field}": [Q_LEARNING, "mac_iaicc"] for field in (  # other values, or other words
-        "num_envs", "gamma", "batch_size", "polyak", "end_e", "exploration_timesteps", "reward_scale", "hidden_size")},
-}  # fmt: skip
+    "DEFAULTS.ct-": [Q_LEARNING, "mac_iaicc"],
+}
 
-# Lines of `train` that may differ between any two scripts: what is stored and the loss.
-OWN_LINES = [
-    r'state = infos\["state"\]',
-    r'buffer\.add\(obs, actions, infos\["macro_done"\](, state)?\)',
-    r"buffer\.step\((state, )?args\.reward_scale \* rewards, step_gamma \* ~terminations, over, obs, infos\)",
-    r"batch = (team_batch\()?buffer\.sample\(args\.batch_size, args\.window, (args\.mixer_state, )?rng, args\.device\)"
-    r"(, agents\))?",
-    r'loss, (joint_q, _|q, _, _) = (td|own)_loss\(\*utilities, (learner\["mixer"\], target\["mixer"\], )?batch, '
-    r"args\.td_lambda, beta\)",
-    r'log\("losses", td_loss=loss, q_values=(joint_q|q\[batch\["valid"\]\])\.mean\(\), grad_norm=grad_norm\)',
-]
-# And those between mac_iaicc.py, an actor-critic that learns from whole episodes, and the others.
-IAICC_LINES = [
-    r"target, agents = copy\.deepcopy\(learner(\[\"critics\"\])?\)\.requires_grad_\(False\), learner\[\"agents\"\]",
-    r"buffer = (ReplayBuffer\(env, args\.buffer_size\)|EpisodeBuffer\(env, args\.batch_size \+ args\.num_envs\))",
-    r"epsilon = np\.interp\(step( - args\.learning_starts)?, \[0, args\.exploration_timesteps\], "
-    r"\[(1\.0|args\.start_e), args\.end_e\]\)",
-    r"# Learn( from the episodes that ended, once)?",
-    r"while updates < \(step - args\.learning_starts\) // args\.train_frequency "
-    r"and buffer\.rows\[buffer\.queue\]\.any\(\):",
-    r"if np\.count_nonzero\(buffer\.rows\[buffer\.queue\]\) >= args\.batch_size:",
-    r"batch = buffer\.take\(args\.device\)",
-    r'utilities = over_rows\(batch, agents, target\["agents"\]\)',
-    r"beta = np\.interp\(\(step - args\.learning_starts\) / args\.exploration_timesteps, \[1, 2\], "
-    r"\[args\.hysteresis, 1\.0\]\)",
-    r"joint = joint_batch\(batch, max\(env\.n_actions\)\)",
-    r'values, target_values = \(x\[\.\.\., 0\] for x in over_rows\(joint, learner\["critics"\], target\)\)  # .*',
-    r"policy = soft_policy\(over_rows\(batch, agents\)\[0\], epsilon\)  # .*",
-    r"returns = own_returns\(batch, target_values, args\.n_step\)",
-    r"losses = actor_critic_loss\(policy, values, returns, batch, args\.entropy_coef\)",
-    r"loss(es\[0\])?\.backward\(\)",
-    r'critics = list\(learner\["critics"\]\.parameters\(\)\)',
-    r"torch\.optim\.swa_utils\.get_ema_multi_avg_fn\(args\.polyak\)\(slow, (fast|critics), None\)",
-    r"if updates % (100|10) == 0:",
-    r'q_values = values\[batch\["valid"\]\]\.mean\(\)',
-    r'log\("losses", td_loss=losses\[2\], q_values=q_values, grad_norm=grad_norm\)',
-    r'log\("losses", actor_loss=losses\[1\], entropy=losses\[3\]\)',
-]
+# Lines of `train` that the named scripts have, in pieces with an empty line between them. Without these, `train` is the
+# same in all scripts. A comment behind a piece's last line stays, unless it is listed, too.
+OWN_LINES = {
+    "avf_vdn dec_maddrqn cen_maddrqn mac_iaicc": """
+        buffer.add_step(args.reward_scale * rewards, np.where(terminations, 0.0, args.gamma))
+""",
+    WITH_MIXER: """
+        state = infos["state"]
+
+        buffer.add_step(state, args.reward_scale * rewards, np.where(terminations, 0.0, args.gamma))
+
+            loss, joint_q, _ = td_loss(
+                utilities, target_utilities, learner["mixer"], target["mixer"], batch, args, hysteresis
+            )
+""",
+    "avf_vdn": """
+            loss, joint_q, _ = td_loss(utilities, target_utilities, batch, args, hysteresis)
+""",
+    "dec_maddrqn": """
+            loss, q, _ = own_loss(utilities, target_utilities, batch, args, hysteresis)
+""",
+    f"{AVF} dec_maddrqn": """
+    target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, without gradients
+
+            utilities = utilities_at_rows(learner["agents"], batch)
+            target_utilities = utilities_at_rows(target["agents"], batch)
+""",
+    "cen_maddrqn": """
+    target = copy.deepcopy(learner).requires_grad_(False)  # the target network, without gradients
+
+            values = values_at_rows(learner["agents"], batch)
+            target_values = values_at_rows(target["agents"], batch)
+            loss, q, _ = td_loss(values, target_values, learner["agents"], batch, args, hysteresis)
+""",
+    AVF: """
+                writer.add_scalar("losses/q_values", joint_q.mean(), step)
+""",
+    "dec_maddrqn cen_maddrqn": """
+                writer.add_scalar("losses/q_values", q.mean(), step)
+""",
+    Q_LEARNING: """
+    seeds = np.random.SeedSequence(args.seed).generate_state(5, np.uint64).tolist()
+    network_seed, explore_seed, replay_seed, env_seed, eval_seed = seeds
+
+    replay_rng = np.random.default_rng(replay_seed)
+
+    buffer = ReplayBuffer(env, args.buffer_size)
+
+        explore_rng.bit_generator.state, replay_rng.bit_generator.state = saved["rngs"]
+
+        phase = (step - args.learning_starts) / args.exploration_timesteps
+
+        epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
+
+        # ---- learn: an update for each multiple of train_frequency that was just passed ----
+        due = step // args.train_frequency - (step - args.num_envs) // args.train_frequency
+        can_learn = step > args.learning_starts and buffer.ended
+        for _ in range(due if can_learn else 0):
+
+            batch = make_batch(buffer.sample(args.batch_size, replay_rng), args.device)
+
+            for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
+
+            if updates % 100 == 0:
+                writer.add_scalar("losses/td_loss", loss, step)
+
+                rngs=(explore_rng.bit_generator.state, replay_rng.bit_generator.state),
+""",
+    "mac_iaicc": """
+    seeds = np.random.SeedSequence(args.seed).generate_state(4, np.uint64).tolist()
+    network_seed, explore_seed, env_seed, eval_seed = seeds
+
+    target = copy.deepcopy(learner["critics"]).requires_grad_(False)  # the target critics, without gradients
+
+    buffer = EpisodeBuffer(env)
+
+        explore_rng.bit_generator.state = saved["explore_rng"]
+
+        phase = (step - args.random_timesteps) / args.exploration_timesteps
+
+        epsilon = np.interp(phase, [0, 1], [args.start_e, args.end_e]) if phase >= 0 else 1.0
+
+        # ---- learn: an update on the episodes that have ended, once there are batch_size ----
+        if len(buffer.ended) >= args.batch_size:
+
+            batch = make_batch(buffer.ended, args.device)
+            buffer.ended.clear()
+            policy = soft_policy(logits_at_rows(learner["agents"], batch), batch["available"], epsilon)
+            values = learner["critics"](batch)  # [B, T, n]
+            returns = own_returns(target(batch), batch, args.n_step)
+            losses = actor_critic_loss(policy, values, returns, batch, args.entropy_coef, hysteresis)
+            loss, actor_loss, critic_loss, entropy = losses
+
+            for slow, fast in zip(target.parameters(), learner["critics"].parameters(), strict=True):
+
+            if updates % 10 == 0:
+                writer.add_scalar("losses/actor_loss", actor_loss, step)
+                writer.add_scalar("losses/critic_loss", critic_loss, step)
+                writer.add_scalar("losses/entropy", entropy, step)
+                writer.add_scalar("losses/values", values[batch["valid"]].mean(), step)
+
+                explore_rng=explore_rng.bit_generator.state,
+""",
+}
 
 
-def scripts(root=ROOT):
+def scripts():
     """The algorithm scripts: {name: text}."""
-    return {name: (root / f"{name}.py").read_text() for name in SCRIPTS}
+    return {name: (ROOT / f"{name}.py").read_text() for name in SCRIPTS}
 
 
 def definitions(text):
@@ -93,86 +174,108 @@ def definitions(text):
         where[name] = first, last or node.end_lineno
 
     for node in ast.parse(text).body:
-        if isinstance(node, ast.ClassDef) and node.name == "Args":
-            for part in node.body:
-                if isinstance(part, ast.AnnAssign):
-                    note(f"Args.{part.target.id}", part)
-                elif isinstance(part, ast.FunctionDef):
-                    note(f"Args.{part.name}", part)
-        elif isinstance(node, ast.ClassDef | ast.FunctionDef):
-            note(node.name, node)
-        elif isinstance(node, ast.Assign) and node.targets[0].id == "DEFAULTS":
-            for key, value in zip(node.value.keys, node.value.values, strict=True):
-                note(f"DEFAULTS.{key.value}", key, value.end_lineno)
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            note(f"import {ast.unparse(node)}", node)
-        elif isinstance(node, ast.Expr):
-            note("", node)  # the module's docstring
+        match node:
+            case ast.ClassDef():
+                name = OTHER_NAMES.get(node.name, node.name)
+                note(name, node, node.body[0].end_lineno if ast.get_docstring(node) else node.lineno)
+                for member in node.body:
+                    if isinstance(member, ast.AnnAssign):
+                        note(f"{name}.{member.target.id}", member)
+                    elif isinstance(member, ast.FunctionDef):
+                        note(f"{name}.{member.name}", member)
+            case ast.FunctionDef():
+                note(node.name, node)
+            case ast.Assign(targets=[ast.Name(id="DEFAULTS")]):
+                for key, value in zip(node.value.keys, node.value.values, strict=True):
+                    note(f"DEFAULTS.{key.value}", key, value.end_lineno)
+            case ast.Assign(targets=[ast.Name(id=name)]):
+                note(name, node)
+            case ast.Import() | ast.ImportFrom():
+                note(f"import {ast.unparse(node)}", node)
+            case ast.Expr():
+                note("", node)  # the module's docstring
     return where
 
 
-def cut(text, where):
-    return "\n".join(text.splitlines()[where[0] - 1 : where[1]])
-
-
 def parts(text):
-    """{name: source} of a script's definitions, with "the rest": what stands between them, without blank lines."""
-    where, lines = definitions(text), text.splitlines()
-    inside = {number for first, last in where.values() for number in range(first, last + 1)}
+    """{name: source} of a script's definitions, and "the rest": what stands between them, without blank lines."""
+    lines = text.splitlines()
+    found = {}
+    inside = set()
+    for name, (first, last) in definitions(text).items():
+        inside.update(range(first, last + 1))
+        if name and not name.startswith("import "):
+            found[name] = "\n".join(lines[first - 1 : last])
     rest = [line for number, line in enumerate(lines, 1) if number not in inside and line.strip()]
-    found = {name: cut(text, place) for name, place in where.items() if name and not name.startswith("import ")}
     return found | {"the rest": "\n".join(rest)}
 
 
 def groups(name, having):
     """The groups of scripts, of those that have it, within which a definition is the same."""
-    found = [set(group.split()) for group in GROUPS.get(name, [" ".join(having)])]
-    if set().union(*found) != set(having) or sum(map(len, found)) != len(having):
+    found = [group.split() for group in GROUPS.get(name, [" ".join(having)])]
+    if sorted(script for group in found for script in group) != sorted(having):
         raise ValueError(f"the table has other scripts for {name} than have it: {' '.join(having)}")
-    return [[script for script in having if script in group] for group in found]
+    return found
 
 
-def diff(one, other, from_name, to_name):
-    return list(difflib.unified_diff(one.splitlines(), other.splitlines(), from_name, to_name, lineterm="", n=1))
+def pieces(own):
+    """The pieces of code in an entry of OWN_LINES: an empty line stands between them."""
+    return [piece for piece in own.strip("\n").split("\n\n") if piece]
 
 
-def stray_lines(one, other, between):
-    """Lines of two versions of `train` that differ and are no script's own; between: the two scripts' names."""
-    allowed = OWN_LINES + (IAICC_LINES if "mac_iaicc" in between else [])
-    lines = [line for line in difflib.ndiff(one.splitlines(), other.splitlines()) if line[0] in "+-"]
-    return [line for line in lines if line[2:].strip() and not any(re.fullmatch(r, line[2:].strip()) for r in allowed)]
+def common_train(script, train):
+    """A script's `train` without its own lines. If these have comments that the table does not have, they stay."""
+    for names, own in OWN_LINES.items():
+        if script in names.split():
+            for piece in pieces(own):
+                train, count = re.subn(rf"^{re.escape(piece)}(\n|(?=  #))", "", train, flags=re.M)
+                if count != 1:
+                    raise ValueError(f"OWN_LINES has lines that are not once in train of {script}.py:\n{piece}")
+    return train
+
+
+def compared(name, sources):
+    """The lines of a diff between the first of several sources, {script: text}, and each of the others."""
+    (first, source), *others = sources.items()
+    lines = []
+    for other, other_source in others:
+        labels = f"{first}.py {name}", f"{other}.py {name}"
+        lines += difflib.unified_diff(source.splitlines(), other_source.splitlines(), *labels, lineterm="", n=1)
+    return lines
+
+
+def train_differences(trains):
+    """Where `train` differs between scripts, {script: text}, but for their own lines; the lines of a diff."""
+    try:
+        return compared("train, what is common", {script: common_train(script, trains[script]) for script in trains})
+    except ValueError as error:
+        return [str(error)]
 
 
 def differences(texts):
     """Where scripts differ that should not, as a diff; empty if nowhere. texts: {name: text}."""
-    split, found = {script: parts(text) for script, text in texts.items()}, []
+    split = {script: parts(text) for script, text in texts.items()}
+    found = []
     for name in dict.fromkeys(name for script in split.values() for name in script):
-        having = [script for script in split if name in split[script]]
-        if name == "train":
-            for one, other in combinations(having, 2):
-                stray = stray_lines(split[one][name], split[other][name], (one, other))
-                found += [f"train, {one}.py (-) and {other}.py (+):", *stray] if stray else []
-            continue
-        for group in groups(name, having):
-            for other in group[1:]:
-                labels = f"{group[0]}.py {name}", f"{other}.py {name}"
-                found += diff(split[group[0]][name], split[other][name], *labels)
+        for group in groups(name, [script for script in split if name in split[script]]):
+            found += compared(name, {script: split[script][name] for script in group})
+    found += train_differences({script: split[script]["train"] for script in split})
     return "\n".join(found)
 
 
 def copied(texts, source, name):
     """{script: text} of the scripts that change when a definition of the source is copied to its group."""
     split = {script: parts(text) for script, text in texts.items()}
-    if name == "train" or name not in definitions(texts[source]):
-        raise ValueError(f"{source}.py has no definition {name} that could be copied")
-    (group,) = (g for g in groups(name, [s for s in split if name in split[s]]) if source in g)
+    if name not in definitions(texts[source]):
+        raise ValueError(f"{source}.py has no definition {name}")
+    having = [script for script in split if name in split[script]]
+    (group,) = (group for group in groups(name, having) if source in group)
     changed = {}
     for script in group:
         if split[script][name] != split[source][name]:
             first, last = definitions(texts[script])[name]
             lines = texts[script].splitlines(keepends=True)
-            new = split[source][name] + "\n"
-            changed[script] = "".join([*lines[: first - 1], new, *lines[last:]])
+            changed[script] = "".join([*lines[: first - 1], split[source][name] + "\n", *lines[last:]])
     return changed
 
 

@@ -1,407 +1,346 @@
-"""AVF-QPLEX: rows, target, networks, acting and learning; what tests/test_sync.py keeps identical is tested here once.
+"""What the AVF scripts share: rows, batches, targets, networks, acting and training.
 
-Where a definition differs between avf_vdn.py, avf_qmix.py and avf_qplex.py, tests run for each kind.
+tests/test_sync.py keeps the definitions of the same name identical. So each is tested once, in avf_qplex.py, and in
+avf_vdn.py too where that one differs. tests/test_avf_mixers.py has the mixers and what they see, and
+tests/test_available.py the macro-actions that cannot be started.
 """
 
 import copy
 import types
-from itertools import product
+from itertools import combinations
 
 import numpy as np
 import pytest
 import torch
 
+import avf_qmix
 import avf_qplex
 import avf_vdn
+import cen_maddrqn
+import dec_maddrqn
 import envs
-from avf_qplex import Agents, Args, QPLEXMixer, ReplayBuffer, act, evaluate, over_rows, td_loss, train
+import mac_iaicc
+from avf_qplex import Agents, Args, ReplayBuffer, act, evaluate, make_batch, td_loss, utilities_at_rows
 from tests.curves import scalars
 from tests.matrix_game import MatrixGame
-from tests.rollouts import (
-    TINY,
-    Episode,
-    Spy,
-    Step,
-    args_for,
-    check_rows,
-    expected_rows,
-    play,
-    step_by_step,
-    windows,
-)
+from tests.rollouts import TINY, Episode, Spy, Step, args_for, check_rows, expected_rows, play, step_by_step
+
+Q_LEARNERS = [avf_vdn, avf_qmix, avf_qplex, dec_maddrqn, cen_maddrqn]
+with_and_without_state = pytest.mark.parametrize("script", [avf_vdn, avf_qplex], ids=lambda script: script.ALGORITHM)
+every_q_learner = pytest.mark.parametrize("script", Q_LEARNERS, ids=lambda script: script.ALGORITHM)
 
 # ---- rows ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("script", [avf_vdn, avf_qplex])
+@with_and_without_state
 @pytest.mark.parametrize("env_id", ["wtd-s", "bp-10"])
 def test_rows_are_the_steps_at_which_somebody_chose(script, env_id):
-    """The memory's rows against the same rows worked out step by step from a log of the episodes."""
-    _, _, buffer, ended = play(script, env_id, 8, lambda env: script.ReplayBuffer(env, 12))
-    places = buffer.queue[-len(ended) :]
-    assert len(ended) < 12 and not buffer.rows[buffer.queue[: -len(ended)]].any(), "free places come first"
+    """The stored rows are the rows worked out step by step from a log of the episodes."""
+    _, _, buffer, ended = play(script, env_id, 5, horizon=60)
+    assert {episode.terminated for episode in ended} == ({False} if env_id == "wtd-s" else {True, False})
+    assert len(buffer.ended) == len(ended)
     longest = 0
-    for place, episode in zip(places, ended, strict=True):
+    for stored, episode in zip(buffer.ended, ended, strict=True):
         rows = expected_rows(episode, 0.9)
-        check_rows(buffer, place, rows)
-        longest = max(longest, *np.diff([row["step"] for row in rows[:-1]]))
+        check_rows(stored, rows)
+        longest = max(longest, *np.diff([row["step"] for row in rows]))
+        only_goes_on = np.eye(stored["available"].shape[2], dtype=bool)[stored["action"]]
+        busy = stored["since"] < np.arange(len(rows))[:, None]
+        np.testing.assert_array_equal(stored["available"][busy], only_goes_on[busy])
     assert longest > 2, "intervals of several steps occur"
 
 
 @pytest.mark.parametrize("env_id", ["wtd-s", "bp-10", "ct-10"])
 def test_replayed_utilities_are_those_of_acting(env_id):
-    """Row by row from an episode's start, with other agents' rows in between."""
-    env, agents, buffer, ended = play(avf_qplex, env_id, 8, lambda env: ReplayBuffer(env, 12))
-    count = len(ended)
-    batch = windows(buffer, range(count), [0] * count, env.horizon)
+    """They are equal at every row, with other agents' rows in between; hidden states move at own decisions alone."""
+    _, agents, buffer, ended = play(avf_qplex, env_id, 5, horizon=50)
     with torch.no_grad():
-        (utilities,) = over_rows(batch, agents)
-    ongoing = 0
+        utilities = utilities_at_rows(agents, make_batch(list(buffer.ended)))
+    busy = 0
     for b, episode in enumerate(ended):
         rows = [step for step in episode.steps if step.free.any()]
         acted = torch.stack([step.utilities for step in rows])  # [rows, n, A]
         torch.testing.assert_close(utilities[b, : len(rows)], acted)
-        assert batch["valid"][b].sum() == len(rows)
-        chosen = np.stack([step.free for step in rows])
-        np.testing.assert_array_equal(batch["chosen"][b, : len(rows)], chosen)
-        ongoing += (~chosen).sum()
-    assert ongoing > 50
+        before = torch.zeros_like(episode.steps[0].hidden)
+        for step in episode.steps:
+            np.testing.assert_array_equal((step.hidden != before).any(1), step.free)
+            before = step.hidden
+        busy += sum((~step.free).sum() for step in rows)
+    assert busy > 50
 
 
 @pytest.mark.parametrize("env_id", ["wtd-s", "ct-10"])
-def test_packing_changes_nothing(env_id):
-    """Windows that begin anywhere, against every agent of every window run on its own; for two networks at once."""
-    env, agents, buffer, _ = play(avf_qplex, env_id, 6, lambda env: ReplayBuffer(env, 9))
-    other = Agents(env.n_actions, env.single_observation_space.shape[1], hidden_size=4)
-    batch = buffer.sample(12, 7, "joint", np.random.default_rng(0))
-    inside = batch["valid"] | batch["valid"].roll(1, 1)  # rows beyond a window are of no meaning
-    assert not batch["chosen"][:, 0].all() and not inside.all()
+def test_networks_run_over_own_decisions_alone(env_id):
+    """Episodes of different lengths side by side give what every agent of every episode gives on its own."""
+    _, agents, buffer, _ = play(avf_qplex, env_id, 4, seed=2, horizon=20)
+    batch = make_batch(list(buffer.ended))
+    assert len({len(episode) for episode in buffer.ended}) > 1
     with torch.no_grad():
-        for utilities, network in zip(over_rows(batch, agents, other), (agents, other), strict=True):
-            torch.testing.assert_close(utilities[inside], step_by_step(network, batch)[inside])
+        torch.testing.assert_close(utilities_at_rows(agents, batch), step_by_step(agents, batch))
 
 
-def test_windows_reach_over_both_ends_and_are_cut_there():
-    """Rows, validity and the macro-action before, of windows that begin before, within and near the end."""
-    _, _, buffer, ended = play(avf_qplex, "wtd-s", 1, lambda env: ReplayBuffer(env, 4), num_envs=1)
-    rows = expected_rows(ended[0], 0.9)
-    last = len(rows) - 1
-    first = [-3, 2, last - 2]
-    batch = windows(buffer, [0, 0, 0], first, 5, "decision")
-    for b, (start, end) in enumerate(((0, 2), (2, 7), (last - 2, last))):
-        for t in range(6):
-            row = start + t
-            assert batch["valid"][b, t] == (row < end)
-            if row > end:
-                assert not batch["chosen"][b, t].any(), "nobody chooses beyond a window"
-                continue
-            for key in ("obs", "action", "state", "reward", "discount"):
-                torch.testing.assert_close(batch[key][b, t], torch.as_tensor(rows[row][key], dtype=batch[key].dtype))
-            since = rows[row]["since"]
-            assert batch["chosen"][b, t].tolist() == (since == row).tolist()
-            previous = [rows[k - 1]["action"][i] if k else -1 for i, k in enumerate(since)]
-            assert batch["previous"][b, t].tolist() == previous
+def test_a_batch_has_whole_episodes_and_repeats_their_final_rows():
+    """All fields, and valid, free, previous and macro_state, against the log of the episodes."""
+    _, _, buffer, ended = play(avf_qplex, "bp-10", 5, horizon=60)
+    batch = make_batch(list(buffer.ended))
+    lengths = [len(expected_rows(episode, 0.9)) for episode in ended]
+    assert min(lengths) < max(lengths) == batch["valid"].shape[1]
+    for b, episode in enumerate(ended):
+        rows = expected_rows(episode, 0.9)
+        repeated = rows + rows[-1:] * (max(lengths) - len(rows))
+        for name in buffer.running.dtype.names:
+            np.testing.assert_allclose(batch[name][b], np.stack([row[name] for row in repeated]), 1e-5, 1e-5)
+        assert batch["valid"][b].tolist() == [True] * (len(rows) - 1) + [False] * (max(lengths) - len(rows) + 1)
+        free = [step.free for step in episode.steps if step.free.any()]
+        np.testing.assert_array_equal(batch["free"][b, : len(rows)], [*free, [True] * 2])
+        assert not batch["free"][b, len(rows) :].any(), "nobody chooses after the end"
+        for k, i in np.ndindex(len(repeated), 2):
+            last = repeated[k]["step"]
+            if last < len(episode.steps):
+                last = max(t for t in range(last + 1) if episode.steps[t].free[i])  # the step of agent i's last choice
+            ran = episode.steps[last - 1].action[i] if last > 0 else -1
+            assert batch["previous"][b, k, i] == ran
+            state = episode.steps[last].state if last < len(episode.steps) else episode.state
+            np.testing.assert_array_equal(batch["macro_state"][b, k, i], state)
 
 
-@pytest.mark.parametrize("script", [avf_vdn, avf_qplex])
+@with_and_without_state
 @pytest.mark.parametrize("capacity", [2, 7])
-def test_windows_never_mix_episodes(script, capacity):
-    """A memory far smaller than what is played, so that places are used again; all that is stored tells its episode.
-    With capacity 2, more episodes end at once than it holds."""
+def test_batches_never_mix_episodes(script, capacity):
+    """All that is stored tells its episode, in far more episodes than the buffer holds.
+
+    With capacity 2, more episodes end at once than it holds. The oldest one makes place.
+    """
     env = envs.make("bp-10", 4, horizon=12)
-    buffer, rng, tag = script.ReplayBuffer(env, capacity), np.random.default_rng(0), np.arange(4.0)
-    with_state = script is avf_qplex
+    buffer = script.ReplayBuffer(env, capacity)
+    rng = np.random.default_rng(0)
+    tag = np.arange(4.0)  # the number of the episode that runs in each environment
+    order = []
+    at_once = 0
     _, infos = env.reset(seed=0)
 
     def tagged(*shape):
         return np.broadcast_to(tag.reshape(4, *[1] * len(shape)), (4, *shape)).astype(np.float32)
 
-    checked, at_once, seen = 0, 0, set()
     for _ in range(150):
+        obs = tagged(2, env.single_observation_space.shape[1])
+        state = tagged(env.state_size)
         actions = rng.integers(0, env.n_actions, (4, 2))
-        state = [tagged(env.state_size)] if with_state else []
-        buffer.add(tagged(2, env.single_observation_space.shape[1]), actions, infos["macro_done"], *state)
+        buffer.begin_rows(obs, {**infos, "state": state}, actions, infos["macro_done"])
         _, _, terminations, truncations, infos = env.step(actions)
         over = terminations | truncations | (rng.random(4) < 0.02)
-        infos["state"], infos["macro_done"] = tagged(env.state_size), infos["macro_done"] | over[:, None]
-        final = tagged(2, env.single_observation_space.shape[1])
-        buffer.step(*state, tag, 0.9 * ~terminations, over, final, infos)
+        buffer.add_step(*([state] if script is avf_qplex else []), tag, 0.9 * ~terminations)
         if over.any():
+            all_free = infos["macro_done"] | over[:, None]
+            buffer.end_episodes(over, obs, {**infos, "state": state, "macro_done": all_free})
+            order += tag[over].tolist()
             at_once = max(at_once, over.sum())
             tag[over] = tag.max() + 1 + np.arange(over.sum())
             _, infos = env.reset(options={"reset_mask": over})
-        assert sorted([*buffer.queue, *buffer.writing]) == list(range(capacity + 4)), "every place is in one list"
-        if not buffer.rows[buffer.queue].any():
-            continue
-        for mixer_state in ("joint", "single", "real") if with_state else ("",):
-            batch = buffer.sample(8, 6, *([mixer_state] if with_state else []), rng)
-            valid = batch["valid"]
-            after = valid.roll(1, 1)
-            for b in range(8):
-                tags = set(batch["obs"][b][valid[b] | after[b]].flatten().tolist())
-                if with_state:
-                    tags |= set(batch["state"][b][valid[b]].flatten().tolist())
-                    tags |= set(batch["next_state"][b][after[b]].flatten().tolist())
-                assert len(tags) == 1
-                checked, seen = checked + 1, seen | tags
-    ended = [buffer.obs[place, 0, 0, 0] for place in buffer.queue[buffer.rows[buffer.queue] > 0]]
-    assert checked > 1000 and len(seen) > 20 and len(ended) == capacity
-    # The newest stay, the oldest first; those that end together have neighbouring numbers, in any order.
-    assert at_once > 2 and min(ended) > max(seen | set(ended)) - capacity - 8 and len(set(ended)) == capacity
+        assert [episode["obs"][0, 0, 0] for episode in buffer.ended] == order[-capacity:]
+        if order:
+            batch = script.make_batch(buffer.sample(8, rng))
+            for name in batch.keys() & {"obs", "state", "last_state", "macro_state"}:
+                of_episode = batch["obs"][:, :1, 0, 0].reshape(8, *[1] * (batch[name].dim() - 1))
+                assert (batch[name] == of_episode).all()
+    assert at_once > 2 and len(order) > 30
 
 
-def test_the_oldest_episode_makes_place():
-    env = envs.make("bp-10", 1)
-    buffer, shape = ReplayBuffer(env, 3), (1, *env.single_observation_space.shape)
-    for number in range(8):
-        obs, state = np.full(shape, number, np.float32), np.zeros((1, env.state_size), np.float32)
-        infos = {"macro_action": np.zeros((1, 2), int), "macro_done": np.ones((1, 2), bool), "state": state}
-        buffer.add(obs, infos["macro_action"], infos["macro_done"], state)
-        buffer.step(state, np.ones(1), np.ones(1), np.ones(1, bool), obs, infos)
-        ended = buffer.queue[buffer.rows[buffer.queue] > 0]
-        assert buffer.obs[ended, 0, 0, 0].tolist() == list(range(max(0, number - 2), number + 1))
-
-
-def chosen_by_hand(choices, ends_at, states=None, gamma=1.0, capacity=2):
-    """A memory of one Box Pushing episode in which agents choose at given steps; reward and state are the step."""
-    env = envs.make("bp-10", 1)
-    buffer, obs = ReplayBuffer(env, capacity), np.zeros((1, *env.single_observation_space.shape), np.float32)
-    for t in range(ends_at):
-        state, later = (np.full((1, env.state_size), time, np.float32) for time in (t, t + 1))
-        over = np.array([t + 1 == ends_at])
-        infos = {"macro_action": np.zeros((1, 2), int), "macro_done": np.ones((1, 2), bool), "state": later}
-        buffer.add(obs, infos["macro_action"], np.array([choices.get(t, (False, False))]), state)
-        buffer.step(state, np.full(1, t), np.full(1, gamma), over, obs, infos)
-    return buffer
-
-
-def test_every_row_of_an_episode_is_replayed_equally_often():
-    """The first and the last too, where the reward often is: were all windows to fit in, one start in 15 would do."""
-    buffer = chosen_by_hand(dict.fromkeys(range(20), (True, True)), 20)
-    batch = buffer.sample(24_000, 6, "joint", np.random.default_rng(0))
-    length = batch["valid"].sum(1)
-    assert length.min() == 1 and length.max() == 6
-    counts = np.bincount(batch["reward"][batch["valid"]].int(), minlength=20)
-    expected = 24_000 * 6 / 25  # a row is in 6 of the 25 windows
-    assert np.abs(counts - expected).max() < 5 * np.sqrt(expected), counts
-
-
-def test_short_episodes_are_drawn_as_often_as_long_ones():
-    env = envs.make("bp-10", 2)
-    buffer, shape = ReplayBuffer(env, 4), (2, *env.single_observation_space.shape)
-    obs, state = np.zeros(shape, np.float32), np.zeros((2, env.state_size), np.float32)
-    infos = {"macro_action": np.zeros((2, 2), int), "macro_done": np.ones((2, 2), bool), "state": state}
-    for t in range(20):
-        buffer.add(obs, infos["macro_action"], infos["macro_done"], state)
-        buffer.step(state, np.array([1, 2]), np.ones(2), np.array([t == 19, t == 3]), obs, infos)
-    assert sorted(buffer.rows[buffer.queue].tolist()) == [0, 0, 5, 21]
-    batch = buffer.sample(10_000, 6, "joint", np.random.default_rng(0))
-    short = batch["reward"][:, 0] == 2
-    assert abs(short.float().mean() - 0.5) < 0.03
-    assert (batch["valid"][short].sum(1) == 4).all(), "what fits is whole"
-    whole = buffer.sample(100, 60, "joint", np.random.default_rng(0))["valid"]
-    assert whole.shape == (100, 21) and set(whole.sum(1).tolist()) == {4, 20}
-
-
-@pytest.mark.parametrize("mixer_state", ["joint", "single", "real", "decision"])
-def test_mixer_state_feeds_the_rows_it_says(mixer_state):
-    """Two agents, decisions worked out by hand; the state is the time step.
-
-    t        0     1     2     3     4     5 (end, truncated)
-    agent 0  a0          a1          a2
-    agent 1  b0    b1          b2
-    row      0     1     2     3     4     5
-    """
-    choices = {0: (True, True), 1: (False, True), 2: (True, False), 3: (False, True), 4: (True, False)}
-    buffer = chosen_by_hand(choices, 5)
-    batch = windows(buffer, [0], [0], 5, mixer_state)
-    size = buffer.state.shape[2]
-    got = batch["state"][0, :5].unflatten(-1, (-1, size))[..., 0].tolist()
-    later = batch["next_state"][0, 1:].unflatten(-1, (-1, size))[..., 0].tolist()
-    # joint: when each agent last chose. single: that of the agent whose macro-action ends with the row's interval,
-    # agent 1 at row 0, 0 at row 1, 1 at row 2, 0 at row 3, both, so 0, at row 4. Every row lasts one step: see the next
-    # test for `real`.
-    expected = {
-        "joint": ([[0, 0], [0, 1], [2, 1], [2, 3], [4, 3]], [[0, 1], [2, 1], [2, 3], [4, 3], [5, 5]]),
-        "single": ([[0], [0], [1], [2], [4]], [[1], [2], [3], [4], [5]]),
-        "real": ([[0], [1], [2], [3], [4]], [[1], [2], [3], [4], [5]]),
-        "decision": ([[0], [1], [2], [3], [4]], [[1], [2], [3], [4], [5]]),
-    }
-    assert (got, later) == expected[mixer_state]
-
-
-@pytest.mark.parametrize(("mixer_state", "times"), [("decision", [0, 4]), ("real", [3, 5])])
-def test_real_state_is_that_of_the_last_step_and_decision_of_the_first(mixer_state, times):
-    """Agents choose at steps 0 and 4, the episode ends after step 5."""
-    buffer = chosen_by_hand({0: (True, True), 4: (True, True)}, 6, gamma=0.5)
-    batch = windows(buffer, [0], [0], 5, mixer_state)
-    assert batch["valid"].sum() == 2
-    assert batch["state"][0, :2, 0].tolist() == times and batch["next_state"][0, 1:3, 0].tolist() == [4, 6]
-    assert batch["reward"][0, :2].tolist() == [0 + 0.5 * 1 + 0.25 * 2 + 0.125 * 3, 4 + 0.5 * 5]
-    assert batch["discount"][0, :2].tolist() == [0.5**4, 0.5**2]
+def test_every_episode_is_drawn_equally_often_and_is_whole():
+    """An episode's length does not matter, and neither does its age."""
+    env = envs.make("bp-10", 20)
+    buffer = ReplayBuffer(env, 20)
+    _, infos = env.reset(seed=0)
+    obs = np.zeros((20, *env.single_observation_space.shape), np.float32)
+    obs += np.arange(20)[:, None, None]  # every row tells its episode
+    state = np.zeros((20, env.state_size), np.float32)
+    for t in range(20):  # environment e's episode has e + 1 rows and a final one
+        buffer.begin_rows(obs, infos, np.zeros((20, 2), int), np.ones((20, 2), bool) & (np.arange(20) >= t)[:, None])
+        buffer.add_step(state, np.zeros(20), np.ones(20))
+        buffer.end_episodes(np.arange(20) == t, obs, {**infos, "macro_action": np.zeros((20, 2), int)})
+    drawn = buffer.sample(20_000, np.random.default_rng(0))
+    counts = np.bincount([int(episode["obs"][0, 0, 0]) for episode in drawn], minlength=20)
+    assert np.abs(counts - 1_000).max() < 5 * np.sqrt(1_000), counts
+    batch = make_batch(drawn[:500])
+    assert batch["valid"].shape == (500, 21)
+    torch.testing.assert_close(batch["valid"].sum(1), batch["obs"][:, 0, 0, 0].long() + 1)
 
 
 # ---- target -------------------------------------------------------------------------------------------------------
 
 
 def hand_made_batch():
-    """Two agents, two macro-actions, two windows of two rows and the row after them, which is the episode's end.
+    """Three episodes of two agents that have two macro-actions each.
 
-    Window 0 (terminates after row 1). Row 0: both choose. Row 1: only agent 1 chooses, agent 0 is ongoing.
-    Window 1 (truncated after row 1). Row 0: both choose. Row 1: only agent 0 chooses, agent 1 is ongoing.
+    Episode 0 terminates after row 1. Row 0: both choose. Row 1: agent 1 chooses, agent 0 goes on.
+    Episode 1 is truncated after row 1. Row 0: both choose. Row 1: agent 0 chooses, agent 1 goes on.
+    Episode 2 is truncated after its only row. Its final row is repeated.
     """
-    both, first, second = [True, True], [True, False], [False, True]
+    both, first, second, none = [True, True], [True, False], [False, True], [False, False]
+    free = torch.tensor([[both, second, both], [both, first, both], [both, both, none]])
+    action = torch.tensor([[[1, 0], [1, 1], [1, 1]], [[0, 1], [1, 1], [1, 1]], [[0, 0], [0, 0], [0, 0]]])
+    available = free[..., None] | torch.nn.functional.one_hot(action, 2).bool()
+    available[2, 2] = True  # a repeated row is the final one, at which both are free
     return {
-        "chosen": torch.tensor([[both, second, both], [both, first, both]]),
-        "action": torch.tensor([[[1, 0], [1, 1], [1, 1]], [[0, 1], [1, 1], [1, 1]]]),
-        "valid": torch.tensor([[True, True, False]] * 2),
-        "reward": torch.tensor([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]),
-        "discount": torch.tensor([[0.81, 0.0, 1.0], [0.9, 0.729, 1.0]]),
-        "state": torch.zeros(2, 3, 1),
-        "next_state": torch.zeros(2, 3, 1),
+        "free": free,
+        "action": action,
+        "available": available,
+        "valid": torch.tensor([[True, True, False], [True, True, False], [True, False, False]]),
+        "reward": torch.tensor([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0], [5.0, 0.0, 0.0]]),
+        "discount": torch.tensor([[0.81, 0.0, 1.0], [0.9, 0.729, 1.0], [0.5, 1.0, 1.0]]),
+        "state": torch.zeros(3, 3, 1),
+        "last_state": torch.zeros(3, 3, 1),
+        "macro_state": torch.zeros(3, 3, 2, 1),
     }
 
 
-# Utilities [window, row, agent, macro-action]: where an agent is ongoing, those of its latest decision.
-ONLINE = torch.tensor([[[[1.0, 2.0], [5.0, 4.0]], [[1.0, 2.0], [6.0, 8.0]], [[7.0, 6.0], [1.0, 9.0]]],
-                       [[[3.0, 1.0], [1.0, 2.0]], [[0.0, 5.0], [1.0, 2.0]], [[2.0, 4.0], [3.0, 2.0]]]])  # fmt: skip
-TARGET = torch.tensor([[[[10.0, 20.0], [15.0, 25.0]], [[10.0, 20.0], [55.0, 65.0]], [[1.0, 2.0], [3.0, 4.0]]],
-                       [[[30.0, 40.0], [35.0, 45.0]], [[50.0, 60.0], [35.0, 45.0]],
-                        [[70.0, 80.0], [75.0, 85.0]]]])  # fmt: skip
+# Utilities [episode, row, agent, macro-action]. Those of a busy agent are those of its latest decision.
+ONLINE = torch.tensor(
+    [
+        [[[1.0, 2.0], [5.0, 4.0]], [[1.0, 2.0], [6.0, 8.0]], [[7.0, 6.0], [1.0, 9.0]]],
+        [[[3.0, 1.0], [1.0, 2.0]], [[0.0, 5.0], [1.0, 2.0]], [[2.0, 4.0], [3.0, 2.0]]],
+        [[[4.0, 9.0], [2.0, 9.0]], [[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, 1.0]]],
+    ]
+)
+TARGET = torch.tensor(
+    [
+        [[[10.0, 20.0], [15.0, 25.0]], [[10.0, 20.0], [55.0, 65.0]], [[1.0, 2.0], [3.0, 4.0]]],
+        [[[30.0, 40.0], [35.0, 45.0]], [[50.0, 60.0], [35.0, 45.0]], [[70.0, 80.0], [75.0, 85.0]]],
+        [[[99.0, 99.0], [99.0, 99.0]], [[6.0, 99.0], [99.0, 8.0]], [[6.0, 99.0], [99.0, 8.0]]],
+    ]
+)
+Q = torch.tensor([7.0, 10.0, 5.0, 7.0, 6.0])
+ONE_ROW_TARGET = torch.tensor([69.85, 2.0, 97.5, 116.995, 12.0])
 
 
-def add(utilities, values, actions, chosen, state):
-    return utilities.sum(-1)
+def add(utilities, actions, available, state):
+    """A mixer that is as plain as VDN's."""
+    return utilities.gather(-1, actions[..., None])[..., 0].sum(-1)
 
 
-def qplex_loss(*utilities, batch, **options):
-    return td_loss(*utilities, add, add, batch, **options)
+def loss_of(script, utilities=ONLINE, target_utilities=TARGET, batch=None, hysteresis=1.0, td_lambda=0.0, **options):
+    """What the script's td_loss says of the batch made by hand, or of another one."""
+    mixers = [] if script is avf_vdn else [add, add]
+    args = script.Args(td_lambda=td_lambda, **options)
+    return script.td_loss(utilities, target_utilities, *mixers, batch or hand_made_batch(), args, hysteresis)
 
 
-def vdn_loss(*utilities, batch, **options):
-    return avf_vdn.td_loss(*utilities, batch, **options)
+@with_and_without_state
+def test_td_target_by_hand(script):
+    """Joint values: 2 + 5 = 7, 2 + 8 = 10; 3 + 2 = 5, 5 + 2 = 7; 4 + 2 = 6. Targets:
+
+    Episode 0, row 0: agent 0 goes on with macro-action 1 (target 20). Agent 1 chooses, online argmax 1, target 65:
+    y = 1 + 0.81 * 85 = 69.85. Row 1: it terminated: y = 2.
+    Episode 1, row 0: agent 0 chooses, online argmax 1, target 60. Agent 1 goes on with macro-action 1, target 45:
+    y = 3 + 0.9 * 105 = 97.5. Row 1: it was truncated, so it bootstraps from the final observation: agent 0 argmax 1,
+    80; agent 1 argmax 0, 75: y = 4 + 0.729 * 155 = 116.995.
+    Episode 2, row 0: agent 0 argmax 0, 6; agent 1 argmax 1, 8: y = 5 + 0.5 * 14 = 12.
+    """
+    loss, q, target = loss_of(script)
+    torch.testing.assert_close(q, Q)
+    torch.testing.assert_close(target, ONE_ROW_TARGET)
+    torch.testing.assert_close(loss, torch.tensor([62.85, -8.0, 92.5, 109.995, 6.0]).square().mean())
 
 
-both_losses = pytest.mark.parametrize("loss_of", [qplex_loss, vdn_loss])
+@with_and_without_state
+def test_hysteresis_scales_negative_errors(script):
+    loss, q, target = loss_of(script, hysteresis=0.5)
+    torch.testing.assert_close(loss, torch.tensor([62.85, -4.0, 92.5, 109.995, 6.0]).square().mean())
+    torch.testing.assert_close((q, target), (Q, ONE_ROW_TARGET), msg="nothing else changes")
 
 
-@both_losses
-def test_td_target_by_hand(loss_of):
-    """Window 0, row 0: agent 0 goes on with macro-action 1 (target 20), agent 1 chooses, online argmax 1, target 65:
-    y = 1 + 0.81 * 85 = 69.85. Row 1: terminated: y = 2. Window 1, row 0: agent 0 chooses, argmax 1, target 60; agent 1
-    goes on with macro-action 1, target 45: y = 3 + 0.9 * 105 = 97.5. Row 1: truncated, so it bootstraps from the final
-    observation: agent 0 argmax 1, 80; agent 1 argmax 0, 75: y = 4 + 0.729 * 155 = 116.995.
-    Joint values: 2 + 5 = 7, 2 + 8 = 10; 3 + 2 = 5, 5 + 2 = 7."""
-    loss, q, target = loss_of(ONLINE, TARGET, batch=hand_made_batch())
-    torch.testing.assert_close(target, torch.tensor([69.85, 2.0, 97.5, 116.995]))
-    torch.testing.assert_close(q, torch.tensor([7.0, 10.0, 5.0, 7.0]))
-    torch.testing.assert_close(loss, torch.tensor([62.85, -8.0, 92.5, 109.995]).square().mean())
-    # Hysteresis scales the one negative error.
-    loss, _, _ = loss_of(ONLINE, TARGET, batch=hand_made_batch(), hysteresis=0.5)
-    torch.testing.assert_close(loss, torch.tensor([62.85, -4.0, 92.5, 109.995]).square().mean())
-
-
-@both_losses
-def test_conditional_argmax_never_changes_an_ongoing_macro_action(loss_of):
-    """Make the other macro-action of the ongoing agents far better: the target must not move."""
+@with_and_without_state
+def test_the_target_never_changes_what_a_busy_agent_runs(script):
+    """Make the other macro-action of the busy agents far better: the target must not move."""
     tempting = ONLINE.clone()
-    tempting[0, 1, 0, 0] = tempting[1, 1, 1, 0] = 1000.0  # both are ongoing there, with macro-action 1
-    _, _, target = loss_of(tempting, TARGET, batch=hand_made_batch())
-    torch.testing.assert_close(target, torch.tensor([69.85, 2.0, 97.5, 116.995]))
+    tempting[0, 1, 0, 0] = tempting[1, 1, 1, 0] = 1000.0  # both are busy there, with macro-action 1
+    torch.testing.assert_close(loss_of(script, tempting)[2], ONE_ROW_TARGET)
 
 
-def test_mixers_see_the_valid_rows_only_and_the_conditional_argmax():
-    """What mixer and target mixer are given for each row; whatever stands beyond a window never reaches one."""
-    seen, batch = {}, hand_made_batch()
-    batch["state"] = torch.arange(6.0).reshape(2, 3, 1)
-    batch["next_state"] = 10 + batch["state"]
+@with_and_without_state
+def test_q_lambda_by_hand(script):
+    """lambda = 0.5. Episode 0: G[1] = 2; G[0] = 1 + 0.81 (0.5 * 85 + 0.5 * 2) = 36.235. Episode 1: G[1] = 116.995;
+    G[0] = 3 + 0.9 (0.5 * 105 + 0.5 * 116.995) = 102.89775. lambda = 1: G[0] = 1 + 0.81 * 2, 3 + 0.9 * 116.995.
+    The last row of an episode keeps the one-row target, because there is no further return. That holds for episode 2,
+    too, which is shorter than the others.
+    """
+    half = loss_of(script, td_lambda=0.5)[2]
+    torch.testing.assert_close(half, torch.tensor([36.235, 2.0, 102.89775, 116.995, 12.0]))
+    whole = loss_of(script, td_lambda=1.0)[2]
+    torch.testing.assert_close(whole, torch.tensor([2.62, 2.0, 108.2955, 116.995, 12.0]))
+
+
+def test_mixers_see_the_choices_of_the_row_and_the_best_choices():
+    """The mixer gets what was run, the target mixer what is best, and both what is available and their states."""
+    batch = hand_made_batch()
+    batch["state"] = torch.arange(9.0).reshape(3, 3, 1)
+    batch["last_state"] = 10 + batch["state"]
+    seen = {}
 
     def mixer(name):
-        def mix(utilities, values, actions, chosen, state):
-            seen[name] = {"q": utilities, "v": values, "m": actions, "chosen": chosen, "state": state}
-            return utilities.sum(-1)
+        def mix(utilities, actions, available, state):
+            seen[name] = utilities, actions, available, state
+            return add(utilities, actions, available, state)
 
         return mix
 
-    td_loss(ONLINE, TARGET, mixer("online"), mixer("target"), batch)
-    tell = {name: {key: value.tolist() for key, value in inputs.items()} for name, inputs in seen.items()}
-    both, first, second = [True, True], [True, False], [False, True]
-    assert tell["online"] == {
-        "q": [[2, 5], [2, 8], [3, 2], [5, 2]],
-        "v": [[2, 5], [2, 8], [3, 2], [5, 2]],
-        "m": [[1, 0], [1, 1], [0, 1], [1, 1]],
-        "chosen": [both, second, both, first],
-        "state": [[0], [1], [3], [4]],
-    }
-    assert tell["target"] == {
-        "q": [[20, 65], [1, 4], [60, 45], [80, 75]],
-        "v": [[20, 65], [2, 4], [60, 45], [80, 85]],
-        "m": [[1, 1], [0, 1], [1, 1], [1, 0]],
-        "chosen": [second, both, first, both],
-        "state": [[11], [12], [14], [15]],
-    }
+    td_loss(ONLINE, TARGET, mixer("online"), mixer("target"), batch, Args(mixer_state="real"))
+    given = batch["available"]
+    torch.testing.assert_close(seen["online"], (ONLINE, batch["action"], given, batch["last_state"]))
+    best = torch.tensor([[[1, 0], [1, 1], [0, 1]], [[0, 1], [1, 1], [1, 0]], [[1, 1], [0, 1], [0, 1]]])
+    torch.testing.assert_close(seen["target"], (TARGET, best, given, batch["state"]))
 
 
-@both_losses
-def test_rows_beyond_a_window_count_nowhere(loss_of):
-    """Window 0 is cut after its first row. Anything in the rows beyond changes neither loss nor gradients."""
-    batch = hand_made_batch()
-    batch["valid"] = torch.tensor([[True, False, False], [True, True, False]])
+@with_and_without_state
+def test_rows_after_the_end_count_nowhere(script):
+    """Whatever stands in the repeats of a final row, and in its own reward, discount and macro-actions, is not read."""
     clean = ONLINE.clone().requires_grad_()
-    loss, q, target = loss_of(clean, TARGET, batch=batch, td_lambda=0.5)
+    loss, _, target = loss_of(script, clean, td_lambda=0.5)
     loss.backward()
-    torch.testing.assert_close(target, torch.tensor([69.85, 102.89775, 116.995]))
-    assert len(q) == 3
-    garbage = {key: batch[key].clone() for key in batch}
-    garbage["reward"][0, 1:], garbage["discount"][0, 2:] = 1e6, 1e6
-    garbage["state"][0, 1:], garbage["next_state"][0, 2:] = torch.nan, torch.nan
-    dirty, dirty_target = ONLINE.clone(), TARGET.clone()
-    dirty[0, 2:] = dirty_target[0, 2:] = torch.nan
+    batch = hand_made_batch()
+    dirty = ONLINE.clone()
+    dirty_target = TARGET.clone()
+    dirty[2, 2] = dirty_target[2, 2] = 1e6
+    batch["reward"][:2, 2] = batch["reward"][2, 1:] = 1e6
+    batch["discount"][:2, 2] = batch["discount"][2, 1:] = 1e6
+    batch["action"][:2, 2] = batch["action"][2, 1:] = 0
+    batch["available"][2, 2, :, 1] = False
     dirty.requires_grad_()
-    other, _, other_target = loss_of(dirty, dirty_target, batch=garbage, td_lambda=0.5)
-    other.backward()
-    torch.testing.assert_close(other, loss)
-    torch.testing.assert_close(other_target, target)
+    dirty_loss, q, got = loss_of(script, dirty, dirty_target, batch, td_lambda=0.5)
+    dirty_loss.backward()
+    torch.testing.assert_close((dirty_loss, q, got), (loss, Q, target))
     torch.testing.assert_close(dirty.grad, clean.grad)
 
 
-@both_losses
-def test_q_lambda_by_hand(loss_of):
-    """lambda = 0.5. Window 0: G[1] = 2; G[0] = 1 + 0.81 (0.5 * 85 + 0.5 * 2) = 36.235. Window 1: G[1] = 116.995;
-    G[0] = 3 + 0.9 (0.5 * 105 + 0.5 * 116.995) = 102.89775. lambda = 1: G[0] = 1 + 0.81 * 2, 3 + 0.9 * 116.995.
-    The row before the end of a window keeps the one-row target: there is no further return in it."""
-    _, _, target = loss_of(ONLINE, TARGET, batch=hand_made_batch(), td_lambda=0.5)
-    torch.testing.assert_close(target, torch.tensor([36.235, 2.0, 102.89775, 116.995]))
-    _, _, target = loss_of(ONLINE, TARGET, batch=hand_made_batch(), td_lambda=1.0)
-    torch.testing.assert_close(target, torch.tensor([2.62, 2.0, 108.2955, 116.995]))
-
-
-@both_losses
-def test_primitive_target_is_the_textbook_one(loss_of):
+@with_and_without_state
+def test_primitive_target_is_the_textbook_one(script):
     """Where every macro-action ends after a step, rows are steps, everybody chooses and the discount is gamma."""
-    _, agents, buffer, _ = play(avf_qplex, "bp-10-primitive", 6, lambda env: ReplayBuffer(env, 9))
-    batch = buffer.sample(8, 10, "joint", np.random.default_rng(0))
-    valid = batch["valid"]
-    assert batch["chosen"][valid | valid.roll(1, 1)].all()
-    assert set(batch["discount"][valid].unique().tolist()) <= {0.0, np.float32(0.9)}
+    _, agents, buffer, _ = play(avf_qplex, "bp-10-primitive", 3, horizon=10)
+    batch = make_batch(list(buffer.ended))
+    assert batch["free"].all() and batch["available"].all()
+    assert set(batch["discount"][batch["valid"]].tolist()) == {np.float32(0.9)}, "all were cut by the horizon"
     other = copy.deepcopy(agents)
     with torch.no_grad():
         for parameter in other.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
-        online, evaluated = over_rows(batch, agents, other)
-    _, _, target = loss_of(online, evaluated, batch=batch)
-    for number, (b, k) in enumerate(np.argwhere(valid.numpy())):
+        online = utilities_at_rows(agents, batch)
+        evaluated = utilities_at_rows(other, batch)
+    _, _, target = loss_of(script, online, evaluated, batch)
+    for number, (b, k) in enumerate(np.argwhere(batch["valid"].numpy())):
         best = sum(evaluated[b, k + 1, i, online[b, k + 1, i].argmax()] for i in range(online.shape[2]))
         torch.testing.assert_close(target[number], batch["reward"][b, k] + batch["discount"][b, k] * best)
 
 
-def test_gradients_reach_everything_and_never_the_target():
-    env, _, buffer, _ = play(avf_qplex, "wtd-s", 6, lambda env: ReplayBuffer(env, 9))
-    learner = avf_qplex.make_learner(Args(hidden_size=8), env)
+@pytest.mark.parametrize("script", [avf_qmix, avf_qplex], ids=lambda script: script.ALGORITHM)
+def test_gradients_reach_everything_and_never_the_target(script):
+    env, _, buffer, _ = play(script, "wtd-s", 3, horizon=40)
+    learner = script.make_learner(script.Args(hidden_size=8), env)
     target = copy.deepcopy(learner)  # with gradients required, so that one that flows is seen
-    batch = buffer.sample(8, 10, "joint", np.random.default_rng(0))
-    utilities = over_rows(batch, learner["agents"], target["agents"])
-    td_loss(*utilities, learner["mixer"], target["mixer"], batch)[0].backward()
+    batch = make_batch(list(buffer.ended))
+    utilities = utilities_at_rows(learner["agents"], batch)
+    target_utilities = utilities_at_rows(target["agents"], batch)
+    loss, _, _ = script.td_loss(utilities, target_utilities, learner["mixer"], target["mixer"], batch, script.Args())
+    loss.backward()
     for name, parameter in learner.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
     assert all(parameter.grad is None for parameter in target.parameters())
@@ -411,168 +350,131 @@ def test_gradients_reach_everything_and_never_the_target():
 
 
 def test_agents_are_separate_gru_networks():
-    """Each agent's slice equals PyTorch's own layers with its weights; padding actions are never available."""
-    agents = Agents([2, 4], obs_size=3, hidden_size=8)
-    obs, previous = torch.randn(2, 5, 3), torch.tensor([[-1, 0, 1, 1, 0], [-1, 3, 2, 1, 0]])
-    start = torch.randn(2, 1, 8)
+    """Each agent's slice equals PyTorch's own layers with its weights."""
+    torch.manual_seed(0)
+    agents = Agents(2, 4, obs_size=3, hidden_size=8)
+    obs = torch.randn(2, 3, 5, 3)  # two agents, three episodes, five decisions
+    previous = torch.randint(-1, 4, (2, 3, 5))
+    start = torch.randn(2, 3, 8)
     with torch.no_grad():
-        utilities, states = agents(obs, previous, start, [1] * 5)
+        utilities, last = agents(obs, previous, start)
         for i in range(2):
-            x = torch.cat([obs[i], torch.eye(5)[previous[i], :4]], 1)  # row -1 of the identity is cut to zeros
+            x = torch.cat([obs[i], torch.eye(5)[previous[i], :4]], -1)  # row -1 of the identity is cut to zeros
             x = torch.relu(x @ agents.encoder.weight[i] + agents.encoder.bias[i])
-            gru = torch.nn.GRUCell(8, 8)
-            gru.weight_ih.copy_(agents.gru_input.weight[i].T)
-            gru.bias_ih.copy_(agents.gru_input.bias[i, 0])
-            gru.weight_hh.copy_(agents.gru_hidden[i].T)
-            gru.bias_hh.zero_()
-            hidden = start[i]
-            for t in range(5):
-                hidden = gru(x[t : t + 1], hidden)
-                torch.testing.assert_close(states[i, t], hidden[0])
-                head = torch.relu(hidden @ agents.head.weight[i] + agents.head.bias[i])
-                expected = (head @ agents.output.weight[i] + agents.output.bias[i])[0, : [2, 4][i]]
-                torch.testing.assert_close(utilities[i, t, : [2, 4][i]], expected)
-    assert (utilities[0, :, 2:] == -torch.inf).all() and not agents.start(3).any()
+            gru = torch.nn.GRU(8, 8, batch_first=True)
+            gru.weight_ih_l0.copy_(agents.input_layer.weight[i].T)
+            gru.bias_ih_l0.copy_(agents.input_layer.bias[i, 0])
+            gru.weight_hh_l0.copy_(agents.hidden_weight[i].T)
+            gru.bias_hh_l0.zero_()
+            states, end = gru(x, start[i : i + 1])
+            head = torch.relu(states @ agents.head.weight[i] + agents.head.bias[i])
+            torch.testing.assert_close(utilities[i], head @ agents.output.weight[i] + agents.output.bias[i])
+            torch.testing.assert_close(last[i], end[0])
+    assert agents.start(3).shape == (2, 3, 8) and not agents.start(3).any()
 
 
 def test_obs_scale_reaches_the_macro_observation_only():
     torch.manual_seed(0)
-    plain, scaled = (Agents([3, 3], 4, 8, obs_scale) for obs_scale in (1.0, 5.0))
+    plain, scaled = (Agents(2, 3, 4, 8, obs_scale) for obs_scale in (1.0, 5.0))
     scaled.load_state_dict(plain.state_dict())
-    obs, previous, hidden = torch.randn(2, 6, 4), torch.randint(-1, 3, (2, 6)), torch.randn(2, 6, 8)
+    obs, previous, hidden = torch.randn(2, 1, 6, 4), torch.randint(-1, 3, (2, 1, 6)), torch.randn(2, 1, 8)
     with torch.no_grad():
-        torch.testing.assert_close(scaled(obs, previous, hidden, [6]), plain(5 * obs, previous, hidden, [6]))
-        assert not torch.allclose(scaled(obs, previous, hidden, [6])[0], plain(obs, previous, hidden, [6])[0])
-    learner = avf_qplex.make_learner(args_for(avf_qplex, "ct-10", hidden_size=32), envs.make("ct-10"))
-    assert learner["agents"].obs_scale == 4.0 and learner["agents"].hidden_size == 32
+        torch.testing.assert_close(scaled(obs, previous, hidden), plain(5 * obs, previous, hidden))
+        assert not torch.allclose(scaled(obs, previous, hidden)[0], plain(obs, previous, hidden)[0])
+    learner = avf_qplex.make_learner(Args(env="ct-10", obs_scale=4.0, hidden_size=32), envs.make("ct-10"))
+    assert learner["agents"].obs_scale == 4.0 and learner["agents"].start(1).shape == (10, 1, 32)
 
 
-def literal_qplex(mixer, utilities, values, actions, chosen, state):
-    """Eqs. 3 and 4 one agent and one head after the other, with the mixer's weights; ongoing agents have A_i = 0."""
-    n, heads = len(utilities), mixer.heads
-    out = mixer.of_state(state)
-    weight, bias, key = out[:n].abs() + 1e-10, out[n : 2 * n], out[2 * n : 2 * n + heads].abs()
-    agent = out[2 * n + heads :].reshape(heads, n)
-    one_hot = torch.cat([torch.eye(mixer.widest)[a] for a in actions])
-    action = mixer.of_action(torch.cat([state, one_hot])).reshape(heads, n)
-    total = 0.0
-    for i in range(n):
-        strength = sum(key[h] * torch.sigmoid(agent[h, i]) * torch.sigmoid(action[h, i]) for h in range(heads))
-        value = values[i] if chosen[i] else utilities[i]
-        total += weight[i] * value + bias[i] + strength * weight[i] * (utilities[i] - value)
-    return total
-
-
-def test_qplex_mixer_is_the_duplex_formula():
-    """And the advantages teach lambda_i, not the utilities: their derivative is the transform's weight alone."""
-    torch.manual_seed(0)
-    for _ in range(20):
-        mixer, state = QPLEXMixer([3, 2, 3], 4, embed=8), torch.randn(4)
-        utilities = torch.randn(3).requires_grad_()
-        values, actions = utilities.detach() + torch.rand(3), torch.tensor([2, 0, 1])
-        chosen = torch.rand(3) < 0.5
-        joint = mixer(utilities, values, actions, chosen, state)
-        torch.testing.assert_close(joint, literal_qplex(mixer, utilities, values, actions, chosen, state))
-        (slopes,) = torch.autograd.grad(joint, utilities)
-        torch.testing.assert_close(slopes, mixer.of_state(state)[:3].abs() + 1e-10)
-
-
-def joint_table(mixer, tables, chosen, actions, state):
-    """Q_tot of every joint macro-action of the agents that choose, the others' being given."""
-    values = torch.stack([table.max() for table in tables])
-    sizes = [len(table) if free else 1 for table, free in zip(tables, chosen, strict=True)]
-    joint = {}
-    for choice in product(*map(range, sizes)):
-        m = [c if free else a for c, free, a in zip(choice, chosen, actions, strict=True)]
-        utilities = torch.stack([table[a] for table, a in zip(tables, m, strict=True)])
-        with torch.no_grad():
-            joint[tuple(m)] = mixer(utilities, values, torch.tensor(m), torch.tensor(chosen), state).item()
-    return joint
-
-
-@pytest.mark.parametrize("mixer_state", ["joint", "real"])
-def test_greedy_utilities_maximise_the_joint_value(mixer_state):
-    """Mac-IGM at random weights, for every set of ongoing agents, with the mixer as the script builds it; and the
-    literal mixer breaks it."""
-    torch.manual_seed(0)
-    env = envs.make("wtd-s")
-    width = env.state_size * (env.n_agents if mixer_state == "joint" else 1)
-    broken = {True: 0, False: 0}
-    for chosen in product([True, False], repeat=env.n_agents):
-        for _ in range(4):
-            # Close calls for those who choose, far apart for the others: where lambda's changes weigh most.
-            scales = [0.1 if free else 5.0 for free in chosen]
-            tables = [scale * torch.randn(size) for size, scale in zip(env.n_actions, scales, strict=True)]
-            actions, state = [int(torch.randint(size, ())) for size in env.n_actions], torch.randn(width)
-            for mask_ongoing in (True, False):
-                args = Args(mixer_state=mixer_state, mask_ongoing=mask_ongoing)
-                mixer = avf_qplex.make_learner(args, env)["mixer"]
-                for parameter in mixer.parameters():
-                    parameter.data *= 3  # weights as they grow: at the start lambda hardly depends on m
-                joint = joint_table(mixer, tables, chosen, actions, state)
-                greedy = tuple(int(t.argmax()) if c else a for t, c, a in zip(tables, chosen, actions, strict=True))
-                broken[mask_ongoing] += joint[greedy] < max(joint.values()) - 1e-4
-    assert broken[True] == 0 and broken[False] > 2
-
-
-# ---- acting and learning ------------------------------------------------------------------------------------------
+# ---- acting -------------------------------------------------------------------------------------------------------
 
 
 def test_acting():
-    """Ongoing agents keep macro-action and recurrent state; epsilon 1 is uniform over an agent's own macro-actions."""
+    """Busy agents keep macro-action and hidden state. Epsilon 1 is uniform over what is available."""
     torch.manual_seed(0)
-    agents, rng = Agents([2, 4], 3, 8), np.random.default_rng(0)
-    obs, hidden = np.random.default_rng(1).random((4000, 2, 3), np.float32), torch.randn(2, 4000, 8)
-    running = rng.integers(2, size=(4000, 2))
-    infos = {"macro_done": rng.random((4000, 2)) < 0.5, "macro_action": running}
-    free = infos["macro_done"]
+    rng = np.random.default_rng(0)
+    agents = Agents(2, 4, 3, 8)
+    obs = rng.random((4000, 2, 3), np.float32)
+    hidden = torch.randn(2, 4000, 8)
+    n_actions = (2, 4)  # agent 0 has two macro-actions, the other two are padding
+    running = rng.integers(n_actions, size=(4000, 2))
+    free = rng.random((4000, 2)) < 0.5
+    own = np.arange(4) < np.array(n_actions)[:, None]
+    available = np.where(free[..., None], own, np.eye(4, dtype=bool)[running])
+    infos = {"macro_done": free, "macro_action": running, "available": available}
     actions, moved = act(agents, obs, infos, hidden, 1.0, rng)
     np.testing.assert_array_equal(actions[~free], running[~free])
     np.testing.assert_array_equal((moved == hidden).all(2).T.numpy(), ~free)
-    for agent, n in enumerate((2, 4)):
+    for agent, n in enumerate(n_actions):
         counts = np.bincount(actions[free[:, agent], agent], minlength=n)
         assert len(counts) == n and (abs(counts / counts.sum() - 1 / n) < 0.05).all()
     greedy, moved = act(agents, obs, infos, hidden)
     with torch.no_grad():
-        inputs = torch.from_numpy(obs).transpose(0, 1), torch.from_numpy(running).T
-        utilities, states = agents(*inputs, hidden, [4000])
-    best = utilities.argmax(2).T.numpy()
+        own_obs = torch.from_numpy(obs).transpose(0, 1)[:, :, None]
+        utilities, states = agents(own_obs, torch.from_numpy(running).T[:, :, None], hidden)
+    utilities = utilities[:, :, 0].transpose(0, 1)
+    best = torch.stack([utilities[:, 0, :2].argmax(1), utilities[:, 1].argmax(1)], 1).numpy()
     np.testing.assert_array_equal(greedy, np.where(free, best, running))
     torch.testing.assert_close(moved[torch.from_numpy(free).T], states[torch.from_numpy(free).T])
-    # epsilon 0.4: the greedy one with probability 0.6 plus its share of the random ones
+    # With epsilon 0.4 the greedy one has probability 0.6 plus its share of the random ones, for each agent by itself.
     actions, _ = act(agents, obs, infos, hidden, 0.4, rng)
-    for agent, n in enumerate((2, 4)):
-        same = (actions == best)[free[:, agent], agent].mean()
-        assert same == pytest.approx(0.6 + 0.4 / n, abs=0.05)
+    same = actions == best
+    for agent, n in enumerate(n_actions):
+        assert same[free[:, agent], agent].mean() == pytest.approx(0.6 + 0.4 / n, abs=0.05)
+    together = same[free.all(1)].all(1).mean()
+    assert together == pytest.approx((0.6 + 0.4 / 2) * (0.6 + 0.4 / 4), abs=0.06)
 
 
-def test_evaluation_counts_the_first_episode_of_each_environment():
-    """Agents that always move to the target, against the same episodes played without the evaluation's code."""
+def test_evaluation_counts_the_first_episode_of_each_environment(monkeypatch):
+    """Agents that always move to the target, against the same episodes played without the evaluation's code.
+
+    Their play is greedy, and hidden states are zero where an episode begins.
+    """
+    acted = Spy(monkeypatch, avf_qplex, "act")
     env = envs.make("ct-10", 40)
-    agents = Agents(env.n_actions, 4, 8)
+    agents = Agents(10, 2, 4, 8)
     agents.output.bias.data[..., 0] = 100.0  # Move-to-T
     result = evaluate(agents, env, 0.9, seed=3)
     env.reset(seed=3)
-    length, success = np.zeros(40), np.zeros(40)
+    length = np.zeros(40)
+    success = np.zeros(40)
     while (length == 0).any():
         _, _, terminations, truncations, _ = env.step(np.zeros((40, 10), int))
         over = terminations | truncations
         first = over & (length == 0)
-        length[first], success[first] = env.elapsed[first], terminations[first]
+        length[first] = env.elapsed[first]
+        success[first] = terminations[first]
         env.reset(options={"reset_mask": over})
     np.testing.assert_array_equal(result["length"], length)
     np.testing.assert_array_equal(result["success"], success)
     np.testing.assert_array_equal(result["return"], success)
     np.testing.assert_allclose(result["discounted_return"], success * 0.9 ** (length - 1))
     assert 0 < success.mean() < 1
+    restarts = 0
+    for call in acted.calls:
+        begins = (call.infos["macro_action"] < 0).all(1)
+        restarts += begins.sum()
+        assert call.epsilon == 0
+        assert not call.hidden[:, begins].any() and call.hidden[:, ~begins].any(2).all()
+    assert restarts > 60
     assert evaluate(agents, env, 0.9, seed=4)["length"].tolist() != length.tolist()
 
 
+# ---- training -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def matrix_game(monkeypatch):
+    """Makes the task "matrix" known: episodes of three steps, so that runs are fast."""
+    monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, {}))
+
+
 class Recorder:
-    """Logs what training does: the learner and its target, the environment's first reset on, actions, buffer."""
+    """Logs what training does: the steps of its environments, the learner and its target, the buffer."""
 
     def __init__(self, monkeypatch, script):
-        self.envs, self.log, self.copies = [], [], []
+        self.envs = []
+        self.log = []
+        self.copies = []
         make = envs.make
 
         def recording(*args, **kwargs):
@@ -582,9 +484,9 @@ class Recorder:
                 step = env.step
 
                 def logged(actions):
-                    before = env._obs.copy(), env._state(), env.macro_done.copy()
+                    before = env._obs.copy(), env._state(), env.macro_done.copy(), env.available.copy()
                     result = step(actions)
-                    self.log.append((*before, env.macro_action.copy(), *(np.copy(x) for x in result[:4]), result[4]))
+                    self.log.append((*before, env.macro_action.copy(), *result))
                     return result
 
                 env.step = logged
@@ -600,80 +502,88 @@ class Recorder:
 
     def episodes(self):
         """Those that ended, in that order, as `tests.rollouts.play` gives them."""
-        count = len(self.log[0][0])
-        running, ended = [[] for _ in range(count)], []
-        for obs, state, free, action, after, reward, terminated, truncated, infos in self.log:
-            for e in range(count):
-                running[e].append(Step(obs[e], state[e], free[e], action[e], reward[e], None))
-                if terminated[e] or truncated[e]:
-                    ended.append(Episode(running[e], after[e], infos["state"][e], terminated[e]))
+        running = [[] for _ in self.log[0][0]]
+        ended = []
+        for *before, after, rewards, terminations, truncations, infos in self.log:
+            for e, steps in enumerate(running):
+                steps.append(Step(*(x[e] for x in before), rewards[e]))
+                if terminations[e] or truncations[e]:
+                    after_it = after[e], infos["state"][e], infos["available"][e]
+                    ended.append(Episode(steps, *after_it, terminations[e]))
                     running[e] = []
         return ended
 
 
-@pytest.mark.parametrize("script", [avf_vdn, avf_qplex])
+@with_and_without_state
 def test_training_stores_what_was_played(tmp_path, monkeypatch, script):
-    """Rows of the memory at the end of a run against its environment's log: discounts, scaled rewards, states before
-    each step, terminations; and a recurrent state starts from zero with every episode."""
-    recorder, acted = Recorder(monkeypatch, script), Spy(monkeypatch, script, "act")
-    options = dict(total_timesteps=800, learning_starts=400, reward_scale=10.0, gamma=0.9, eval_frequency=800)
-    train_args = args_for(script, "wtd-s", runs_dir=str(tmp_path), **{**TINY, **options})
-    script.train(train_args)
-    ended, buffer = recorder.episodes(), recorder.buffers[0]
-    assert 1 < len(ended) < 50
-    for place, episode in zip(buffer.queue[-len(ended) :], ended, strict=True):
-        check_rows(buffer, place, expected_rows(episode, 0.9, reward_scale=10.0))
+    """Rows at the end of a run against its environment's log: discounts, scaled rewards, states before each step,
+    terminations. A hidden state starts from zero with every episode."""
+    recorder = Recorder(monkeypatch, script)
+    acted = Spy(monkeypatch, script, "act")
+    options = dict(total_timesteps=680, learning_starts=600, reward_scale=10.0, gamma=0.9, eval_frequency=800)
+    script.train(args_for(script, "wtd-s", runs_dir=str(tmp_path), **{**TINY, **options}))
+    ended = recorder.episodes()
+    assert 1 < len(ended) < 50 and len(recorder.buffers[0].ended) == len(ended)
+    for stored, episode in zip(recorder.buffers[0].ended, ended, strict=True):
+        check_rows(stored, expected_rows(episode, 0.9, reward_scale=10.0))
     exploring = [call for call in acted.calls if call.rng is not None]
-    assert len(exploring) == 200 and len(recorder.log) == 200
+    assert len(exploring) == len(recorder.log) == 170
     restarts = 0
     for call in exploring:
         fresh = (call.infos["macro_action"] < 0).all(1)
         restarts += fresh.sum()
         assert not call.hidden[:, fresh].any() and call.hidden[:, ~fresh].abs().sum((0, 2)).bool().all()
-    assert restarts == 4 + len(ended) - sum(len(log[0]) for log in recorder.log[-1:] if (log[6] | log[7]).any())
+    assert restarts == 4 + len(ended) - sum(over.sum() for over in [recorder.log[-1][7] | recorder.log[-1][8]])
 
 
-@pytest.mark.parametrize(
-    "env_id, options",
-    [("ct-10", {})]
-    + [("wtd-s", dict(mixer_state=m)) for m in ("single", "real", "decision")]
-    + [("bp-10", dict(mask_ongoing=False)), ("bp-10", dict(td_lambda=0.8, hysteresis=0.5, learning_rate_end=0.0))]
-    + [("bp-10-primitive", {}), ("wtd-s-primitive", {}), ("ct-10-primitive", {})],
-)
-def test_smoke_run_takes_gradient_steps(tmp_path, monkeypatch, env_id, options):
-    smoke(tmp_path, monkeypatch, avf_qplex, env_id, options)
+def smoke(folder, monkeypatch, script, env_id, **options):
+    """A short run makes the updates that are due, changes every parameter and stays finite; it logs evaluations.
 
-
-def smoke(tmp_path, monkeypatch, script, env_id, options):
+    Returns the arguments of the first call of td_loss. Episodes are cut after 20 steps.
+    """
+    domain, keywords = envs._TASKS[env_id]
+    monkeypatch.setitem(envs._TASKS, env_id, (domain, {**keywords, "horizon": 20}))
     losses = Spy(monkeypatch, script, "td_loss")
-    args = args_for(script, env_id, runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 800, **options})
-    folder = script.train(args)
-    assert len(losses.calls) == (800 - 200) // 40
+    short = dict(num_envs=5, total_timesteps=200, learning_starts=80, train_frequency=20, eval_frequency=100)
+    args = args_for(script, env_id, runs_dir=str(folder), **{**TINY, **short, **options})
+    run = script.train(args)
+    assert len(losses.calls) == 6, "one for each multiple of 20 after step 80; episodes end at step 100 or before"
     assert all(torch.isfinite(x).all() for result in losses.results for x in result)
-    torch.manual_seed(args.seed)
+    torch.manual_seed(np.random.SeedSequence(args.seed).generate_state(1, np.uint64).item())
     start = script.make_learner(args, envs.make(env_id)).state_dict()
-    networks = script.load(folder / "last.pt")["networks"]
+    networks = script.load(run / "last.pt")["networks"]
     assert networks.keys() == start.keys()
     same = [name for name, value in networks.items() if torch.equal(value, start[name])]
     assert not same, "every parameter was updated"
-    assert [step for step, _ in scalars(folder)["eval/return"]] == [400, 800]
+    assert [step for step, _ in scalars(run)["eval/return"]] == [100, 200]
+    return losses.calls[0]
 
 
-def test_same_seed_same_curve_and_seed_zero_counts(tmp_path):
+@pytest.mark.parametrize("env_id", envs.IDS)
+def test_smoke_run_takes_gradient_steps(tmp_path, monkeypatch, env_id):
+    smoke(tmp_path, monkeypatch, avf_qplex, env_id)
+
+
+def test_same_seed_same_curve_and_seed_zero_counts(tmp_path, matrix_game):
+    """A seed changes what is played and what is learned."""
     curves = []
     for run, seed in enumerate((0, 0, 1)):
-        options = {**TINY, "train_frequency": 6, "total_timesteps": 800, "eval_frequency": 800}
-        folder = train(args_for(avf_qplex, "wtd-s", seed=seed, runs_dir=str(tmp_path / str(run)), **options))
-        curves.append(scalars(folder))
-    assert "losses/td_loss" in curves[0]
-    assert curves[0] == curves[1] and curves[0] != curves[2]
+        short = {**TINY, "total_timesteps": 520, "learning_starts": 100, "train_frequency": 4, "batch_size": 2}
+        args = Args(env="matrix", seed=seed, runs_dir=f"{tmp_path}/{run}", **short)
+        curves.append(scalars(avf_qplex.train(args)))
+    assert curves[0] == curves[1]
+    tags = {"charts/episodic_return", "losses/td_loss", "losses/q_values", "losses/grad_norm"}
+    rest = {"charts/epsilon", "eval/return", "eval/discounted_return", "eval/length", "eval/success"}
+    assert curves[0].keys() == tags | rest
+    for tag in tags:
+        assert curves[0][tag] != curves[2][tag], tag
 
 
-def test_epsilon_falls(tmp_path, monkeypatch):
+def test_epsilon_falls(tmp_path, monkeypatch, matrix_game):
     acted = Spy(monkeypatch, avf_qplex, "act")
-    options = {**TINY, "total_timesteps": 8_000, "learning_starts": 2_000, "exploration_timesteps": 4_000}
-    options |= dict(num_envs=20, eval_frequency=8_000)
-    folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **options))
+    options = dict(total_timesteps=8_000, learning_starts=2_000, exploration_timesteps=4_000, end_e=0.05)
+    options |= dict(num_envs=20, eval_frequency=2_000, train_frequency=10_000)
+    folder = avf_qplex.train(Args(env="matrix", runs_dir=str(tmp_path), **{**TINY, **options}))
     logged = scalars(folder)["charts/epsilon"]
     assert [step for step, _ in logged] == [2_000, 4_000, 6_000, 8_000]
     assert [round(value, 2) for _, value in logged] == [1.0, 0.53, 0.05, 0.05]
@@ -682,74 +592,192 @@ def test_epsilon_falls(tmp_path, monkeypatch):
     assert all(call.epsilon == 0 for call in acted.calls if call.rng is None), "evaluation is greedy"
 
 
-@pytest.mark.parametrize("script", [avf_vdn, avf_qplex])
-def test_first_update_moves_the_target_by_polyak(tmp_path, monkeypatch, script):
-    recorder, losses = Recorder(monkeypatch, script), Spy(monkeypatch, script, "td_loss")
-    options = {**TINY, "total_timesteps": 400, "train_frequency": 200, "polyak": 0.9, "learning_rate": 0.01}
-    options["learning_rate_end"] = 1.0
-    script.train(args_for(script, "bp-10", runs_dir=str(tmp_path), **options))
+@with_and_without_state
+def test_first_update_moves_the_target_by_polyak(tmp_path, monkeypatch, matrix_game, script):
+    recorder = Recorder(monkeypatch, script)
+    losses = Spy(monkeypatch, script, "td_loss")
+    short = {**TINY, "total_timesteps": 480, "train_frequency": 400}
+    args = script.Args(env="matrix", runs_dir=str(tmp_path), polyak=0.9, learning_rate=0.1, **short)
+    script.train(args)
     assert len(losses.calls) == 1
     ((learner, target),) = recorder.copies
-    torch.manual_seed(1)
-    start = script.make_learner(args_for(script, "bp-10", **options), recorder.envs[0]).state_dict()
+    torch.manual_seed(np.random.SeedSequence(args.seed).generate_state(1, np.uint64).item())
+    start = script.make_learner(args, recorder.envs[0]).state_dict()
     for name, value in target.state_dict().items():
         expected = 0.9 * start[name] + 0.1 * learner.state_dict()[name]
         torch.testing.assert_close(value, expected)
         assert not torch.allclose(expected, start[name], atol=1e-5), name
+    assert not any(parameter.requires_grad for parameter in target.parameters())
 
 
-def test_training_passes_on_what_it_should(tmp_path, monkeypatch):
-    """Evaluation seeds differ from point to point and from run to run; hysteresis and step size follow their schedules;
-    the gradient is clipped; loss and networks get the settings."""
-    evaluated, losses = Spy(monkeypatch, avf_qplex, "evaluate"), Spy(monkeypatch, avf_qplex, "td_loss")
-    optimizers, rates, norms = [], [], []
+@pytest.fixture
+def adam(monkeypatch):
+    """Notes the learning rate and the norm of the gradient at every step of an optimizer."""
+    seen = types.SimpleNamespace(rates=[], norms=[])
+    step = torch.optim.Adam.step
 
-    class Adam(torch.optim.Adam):
-        def __init__(self, *args, **kwargs):
-            super().__init__(*args, **kwargs)
-            optimizers.append(self)
+    def spied(self, closure=None):
+        seen.rates.append(self.param_groups[0]["lr"])
+        seen.norms.append(sum(p.grad.square().sum() for p in self.param_groups[0]["params"]).sqrt().item())
+        return step(self, closure)
 
-        def step(self, closure=None):
-            parameters = self.param_groups[0]["params"]
-            rates.append(self.param_groups[0]["lr"])
-            norms.append(sum(p.grad.square().sum() for p in parameters).sqrt().item())
-            return super().step(closure)
+    monkeypatch.setattr(torch.optim.Adam, "step", spied)
+    return seen
 
-    monkeypatch.setattr(torch.optim, "Adam", Adam)
-    options = dict(hysteresis=0.2, exploration_timesteps=400, learning_rate=1e-3, learning_rate_end=0.0,
-                   max_grad_norm=1e-3, td_lambda=0.25)  # fmt: skip
+
+def test_training_passes_on_what_it_should(tmp_path, monkeypatch, matrix_game, adam):
+    """Hysteresis and step size follow their schedules, the gradient is clipped, loss and networks get the settings.
+
+    Evaluation seeds differ from point to point and from run to run.
+    """
+    evaluated = Spy(monkeypatch, avf_qplex, "evaluate")
+    losses = Spy(monkeypatch, avf_qplex, "td_loss")
+    options = dict(hysteresis=0.2, exploration_timesteps=200, learning_rate=1e-3, max_grad_norm=1e-3, td_lambda=0.25)
+    options |= TINY | dict(learning_starts=600)
     for seed in (0, 1):
-        train(args_for(avf_qplex, "bp-10", seed=seed, runs_dir=str(tmp_path), **{**TINY, **options}))
+        avf_qplex.train(Args(env="matrix", seed=seed, runs_dir=str(tmp_path), gamma=0.97, **options))
     seeds = [call.seed for call in evaluated.calls]
-    assert len(seeds) == len(set(seeds)) == 6 and all(call.gamma == 0.95 for call in evaluated.calls)
-    # The first updates wait for an episode to end; the 25th is made after the step from 1,196 to 1,200.
-    learned = [call for call in losses.calls if call.td_lambda == 0.25]
-    assert len(learned) == 50 and len(learned[0].utilities) == 8 and learned[0].utilities.shape[1] == 7
-    steps = np.array([236 + 40 * k for k in range(25)])
-    betas = [call.hysteresis for call in learned[:25]]
-    assert betas == pytest.approx(np.interp((steps + 4 - 200) / 400, [1, 2], [0.2, 1.0]))
-    assert betas[0] == 0.2 and 0.2 < betas[10] < 1 and betas[-1] == 1.0
-    assert rates[:25] == pytest.approx(1e-3 * (1 - steps / 1_200))
-    assert len(optimizers) == 2 and max(norms) == pytest.approx(1e-3, rel=1e-3)
+    assert len(seeds) == len(set(seeds)) == 6 and {call.gamma for call in evaluated.calls} == {0.97}
+    assert [call.args.seed for call in losses.calls] == [0] * 15 + [1] * 15
+    steps = np.arange(640, 1_201, 40)
+    for call in losses.calls:
+        assert call.args.td_lambda == 0.25 and call.batch["valid"].shape[0] == 8
+        assert call.utilities.requires_grad and not call.target_utilities.requires_grad
+        assert call.mixer is not call.target_mixer
+    # The schedule is that of the step before which the agents acted.
+    factors = [call.hysteresis for call in losses.calls[:15]]
+    assert factors == pytest.approx(np.interp((steps - 4 - 600) / 200, [1, 2], [0.2, 1.0]))
+    assert factors[0] == 0.2 and 0.2 < factors[7] < 1 and factors[-1] == 1.0
+    assert adam.rates[:15] == pytest.approx(1e-3 * (1 - steps / 1_200))
+    assert max(adam.norms) == pytest.approx(1e-3, rel=1e-3)
 
 
-def test_step_size_is_constant_without_an_end(tmp_path, monkeypatch):
-    rates, step = [], torch.optim.Adam.step
-    monkeypatch.setattr(torch.optim.Adam, "step", lambda self: rates.append(self.param_groups[0]["lr"]) or step(self))
-    options = {**TINY, "total_timesteps": 600, "learning_rate": 3e-4, "learning_rate_end": 1.0}
-    train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **options))
-    assert rates == [3e-4] * 10
+def test_the_learning_rate_is_never_negative(tmp_path, matrix_game, adam):
+    """The last step may go beyond total_timesteps, here to 1,208."""
+    options = {**TINY, "num_envs": 8, "total_timesteps": 1_201, "train_frequency": 8, "learning_starts": 1_150}
+    avf_qplex.train(Args(env="matrix", runs_dir=str(tmp_path), learning_rate=1e-3, **options))
+    assert adam.rates[-2] == pytest.approx(1e-3 / 1_201) and adam.rates[-1] == 0.0 and min(adam.rates) == 0.0
 
 
-def test_finds_the_optimum_of_a_non_monotonic_game(tmp_path, monkeypatch):
+def test_the_learning_rate_may_be_constant(tmp_path, matrix_game, adam):
+    options = {**TINY, "learning_starts": 400, "total_timesteps": 600, "learning_rate": 3e-4, "anneal_lr": False}
+    avf_qplex.train(Args(env="matrix", runs_dir=str(tmp_path), **options))
+    assert adam.rates == [3e-4] * 5
+
+
+@every_q_learner
+@pytest.mark.parametrize(
+    ("learning_starts", "train_frequency", "steps"),
+    [
+        (0, 1, [6, 6, 8, 8, 10, 10, 12, 12, 14, 14, 16, 16, 18, 18, 20, 20]),
+        (9, 2, [10, 12, 14, 16, 18, 20]),
+        (10, 2, [12, 14, 16, 18, 20]),
+        (0, 3, [6, 10, 12, 16, 18]),
+        (0, 4, [8, 12, 16, 20]),
+        (8, 4, [12, 16, 20]),
+        (0, 20, [20]),
+    ],
+)
+def test_no_update_is_owed(tmp_path, monkeypatch, matrix_game, script, learning_starts, train_frequency, steps):
+    """Two environments whose episodes take three steps: the first ones end at step 6 of the run.
+
+    An update is due for each multiple of train_frequency that a step passes. What was passed up to learning_starts, or
+    before an episode had ended, is not made up for.
+    """
+    recorder = Recorder(monkeypatch, script)
+    updated = []
+    make_batch = script.make_batch
+
+    def spied(*args):
+        updated.append(2 * len(recorder.log))
+        return make_batch(*args)
+
+    monkeypatch.setattr(script, "make_batch", spied)
+    options = dict(num_envs=2, total_timesteps=20, eval_episodes=1, batch_size=2, hidden_size=4, buffer_size=10)
+    args = script.Args(env="matrix", runs_dir=str(tmp_path), **options)
+    args.learning_starts = learning_starts
+    args.train_frequency = train_frequency
+    script.train(args)
+    assert updated == steps
+
+
+@pytest.mark.parametrize("script", [*Q_LEARNERS, mac_iaicc], ids=lambda script: script.ALGORITHM)
+def test_random_streams_share_no_numbers(tmp_path, monkeypatch, matrix_game, script):
+    """Exploration, replay, environments and evaluations of two runs draw different numbers, and so do networks.
+
+    Nothing is seeded with the run's seed itself, because a user may do that elsewhere.
+    """
+    seeds = {}
+    generators = {}
+    default_rng = np.random.default_rng
+    reset = envs.MacroVectorEnv.reset
+
+    def spied_rng(seed=None):
+        generators[f"{run}: generator {len(generators)}"] = default_rng(seed)
+        return default_rng(seed)
+
+    def spied_reset(self, *, seed=None, options=None):
+        result = reset(self, seed=seed, options=options)
+        if seed is not None:
+            generators[f"{run}: environments {len(generators)}"] = copy.deepcopy(self.np_random)
+        return result
+
+    monkeypatch.setattr(np.random, "default_rng", spied_rng)
+    monkeypatch.setattr(envs.MacroVectorEnv, "reset", spied_reset)
+    monkeypatch.setattr(torch, "manual_seed", lambda seed: seeds.setdefault(run, seed))
+    for run in (0, 1):
+        options = dict(total_timesteps=6, num_envs=2, eval_frequency=2, eval_episodes=1, hidden_size=4)
+        script.train(script.Args(env="matrix", seed=run, runs_dir=str(tmp_path), **options))
+    own = 1 if script is mac_iaicc else 2  # exploration, and replay where there is one
+    assert len(generators) == 2 * (own + 1 + 3), "in each run the environment has one and each evaluation"
+    for seed in (0, 1):
+        generators[f"default_rng({seed})"] = default_rng(seed)
+    for seed in seeds.values():
+        generators[f"default_rng of the networks' seed {seed}"] = default_rng(seed)
+    drawn = {name: set(rng.bit_generator.random_raw(10_000).tolist()) for name, rng in generators.items()}
+    for one, other in combinations(drawn, 2):
+        assert not drawn[one] & drawn[other], (one, other)
+
+
+@every_q_learner
+def test_the_default_run_ends_without_hysteresis(tmp_path, monkeypatch, matrix_game, script):
+    """By the schedule on all tasks, and by the last update of a run with lengths of a 500th of those on bp-10."""
+    for env_id in envs.IDS:
+        args = args_for(script, env_id)
+        phase = (args.total_timesteps - args.num_envs - args.learning_starts) / args.exploration_timesteps
+        assert np.interp(phase, [1, 2], [args.hysteresis, 1.0]) == 1.0, env_id
+    args = args_for(script, "bp-10", runs_dir=str(tmp_path), num_envs=4, hidden_size=4, batch_size=2, eval_episodes=1)
+    args.env = "matrix"
+    assert args.hysteresis < 1
+    for name in ("total_timesteps", "learning_starts", "exploration_timesteps"):
+        setattr(args, name, getattr(args, name) // 500)
+    losses = Spy(monkeypatch, script, "own_loss" if script is dec_maddrqn else "td_loss")
+    script.train(args)
+    assert losses.calls[0].hysteresis == args.hysteresis and losses.calls[-1].hysteresis == 1.0
+
+
+@pytest.mark.slow
+def test_finds_the_optimum_of_a_non_monotonic_game(tmp_path, matrix_game):
     """Payoff 8 for (a, a), -12 beside it, 0 elsewhere: the average over what the other does speaks against a.
 
     With hysteretic errors, as on Box Pushing: with the plain loss QPLEX stays at 0 for thousands of updates.
     """
-    monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, {}))
-    args = Args(env="matrix", runs_dir=str(tmp_path), total_timesteps=6_000, learning_starts=500, train_frequency=24,
-                exploration_timesteps=100_000, end_e=1.0, learning_rate=1e-3, batch_size=32, window=4, polyak=0.95,
-                td_lambda=1.0, hysteresis=0.5, eval_frequency=1_000, eval_episodes=1)  # fmt: skip
+    args = Args(
+        env="matrix",
+        runs_dir=str(tmp_path),
+        total_timesteps=6_000,
+        learning_starts=500,
+        train_frequency=24,
+        exploration_timesteps=100_000,
+        end_e=1.0,
+        anneal_lr=False,
+        batch_size=32,
+        polyak=0.95,
+        td_lambda=1.0,
+        hysteresis=0.5,
+        eval_frequency=1_000,
+        eval_episodes=1,
+    )
     for seed in (1, 2):
         args.seed = seed
-        assert [value for _, value in scalars(train(args))["eval/return"][-3:]] == [8.0] * 3
+        assert [value for _, value in scalars(avf_qplex.train(args))["eval/return"][-3:]] == [8.0] * 3

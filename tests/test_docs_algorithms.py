@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.short_runs import short
+from tests.short_runs import cut_episodes, short
 from tests.sync import ROOT, SCRIPTS
 
 PAGE = (ROOT / "docs" / "algorithms.md").read_text()
@@ -51,8 +51,9 @@ LOGGED = {}  # script: keys of a short run
 def test_every_logged_key_is_explained(name, tmp_path, monkeypatch):
     script, keys = import_module(name), set()
     monkeypatch.setattr(script.SummaryWriter, "add_scalar", lambda writer, key, value, step: keys.add(key))
+    cut_episodes(monkeypatch, 10)
     options = dict(num_envs=20, total_timesteps=2_000, eval_frequency=2_000, batch_size=1, hidden_size=8)
-    more = dict(train_frequency=10, learning_starts=0, window=2) if name != "mac_iaicc" else {}
+    more = dict(train_frequency=10, learning_starts=0) if name != "mac_iaicc" else {}
     script.train(short(script, "bp-10", tmp_path, **options, **more))
     LOGGED[name] = keys
     explained = set(re.findall(r"^\| `(\w+/\w+)` \| ", section("What a run leaves, and what it logs"), re.M))

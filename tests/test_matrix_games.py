@@ -10,8 +10,6 @@ Not shown: that QPLEX finds the optimum of every non-monotonic game by the plain
 has no joint values and learns from its own policy's play; it is here for completeness.
 """
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -32,11 +30,11 @@ RISKY = np.array([(8.0, -12.0, -12.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])  # age
 
 VALUES = [avf_vdn, avf_qmix, avf_qplex, cen_maddrqn]  # those that have a joint value
 SEED = 1
-# One setting per game, the same for every algorithm that learns values. A bigger step is enough where all goes well.
+# One setting per game, the same for every algorithm that learns values: payoffs, updates and learning rate.
 SETTINGS = {
-    "additive": (ADDITIVE, 300, dict(learning_rate=5e-3)),
-    "monotonic": (MONOTONIC, 400, dict(learning_rate=5e-3)),
-    "risky": (RISKY, 600, dict(learning_rate=2e-3)),
+    "additive": (ADDITIVE, 140, 0.01),
+    "monotonic": (MONOTONIC, 160, 0.01),
+    "risky": (RISKY, 240, 0.005),
 }
 
 
@@ -45,17 +43,29 @@ def play(monkeypatch, tmp_path):
     """play(script, game, **options) trains and returns the payoff of the greedy choices and the joint values [3, 3]."""
 
     def play(script, game, **options):
-        payoff, updates, setting = SETTINGS[game]
+        payoff, updates, learning_rate = SETTINGS[game]
         monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, dict(payoff=payoff, tell=True)))
-        options = setting | options
+        settings = dict(
+            learning_rate=learning_rate,
+            anneal_lr=False,
+            gamma=1.0,
+            hidden_size=32,
+            eval_episodes=1,
+            reward_scale=1.0,
+        )
         if script is not mac_iaicc:
-            uniform = dict(total_timesteps=512 + 8 * updates, learning_starts=512, train_frequency=8, end_e=1.0,
-                           batch_size=32, window=3, buffer_size=500, polyak=0.95)  # fmt: skip
-            options = uniform | options
-        shared = dict(env="matrix", seed=SEED, runs_dir=str(tmp_path), gamma=1.0, hidden_size=32, eval_episodes=1,
-                      reward_scale=1.0, learning_rate_end=1.0)  # fmt: skip
-        args = dataclasses.replace(script.parse_args(["--env=wtd-s"]), **shared | options)
+            settings |= dict(
+                total_timesteps=512 + 8 * updates,
+                learning_starts=512,
+                train_frequency=8,
+                end_e=1.0,
+                batch_size=32,
+                buffer_size=500,
+                polyak=0.95,
+                td_lambda=0.0,
+            )
         values = record_values(script, monkeypatch) if script in VALUES else None
+        args = script.Args(env="matrix", seed=SEED, runs_dir=str(tmp_path), **{**settings, **options})
         return scalars(script.train(args))["eval/return"][-1][1], values
 
     return play
@@ -63,16 +73,15 @@ def play(monkeypatch, tmp_path):
 
 def record_values(script, monkeypatch):
     """Q of the nine first joint macro-actions, [3, 3], which training fills in: what the loss last said of each."""
-    values, td_loss = np.full((3, 3), np.nan), script.td_loss
+    values = np.full((3, 3), np.nan)
+    td_loss = script.td_loss
 
     def recording(*args):
         loss, q, target = td_loss(*args)
         (batch,) = (x for x in args if isinstance(x, dict))
-        valid = batch["valid"]
-        first = (batch["previous"] < 0).all(2) & valid  # rows before which nobody has chosen
-        action = batch["action"][first].numpy()  # of each agent, or the number of the team's
-        at = tuple(action.T) if action.shape[1] == 2 else np.unravel_index(action[:, 0], values.shape)
-        values[at] = q.detach()[first[valid]].numpy()
+        actions = batch["action"][:, 0].numpy()  # [B, 2]
+        first = (batch["previous"] < 0).all(2)[batch["valid"]]  # which of the valid rows begin an episode
+        values[tuple(actions.T)] = q.detach()[first].numpy()
         return loss, q, target
 
     monkeypatch.setattr(script, "td_loss", recording)
@@ -146,12 +155,14 @@ def test_monotonic_game_is_beyond_a_sum(play):
     assert rms(values - best_sum(MONOTONIC)) < 0.8, "no worse than it must be"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", VALUES[2:], ids=lambda s: s.__name__)
 def test_risky_game_is_solved_beyond_monotone_mixers(play, script):
     greedy, values = play(script, "risky")
     assert greedy == 8 and worst(values, RISKY) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script, bound", [(avf_vdn, 5), (avf_qmix, 4)], ids=["avf_vdn", "avf_qmix"])
 def test_risky_game_is_missed_by_monotone_mixers(play, script, bound):
     """Both end near the best sum, which prefers agent 0's safe choices."""
@@ -160,6 +171,7 @@ def test_risky_game_is_missed_by_monotone_mixers(play, script, bound):
     assert rms(values - RISKY) > 4 and rms(values - best_sum(RISKY)) < 2
 
 
+@pytest.mark.slow
 def test_independent_learners_average_over_the_other(play):
     """Under uniform play a is worth -16/3 to agent 0, as for VDN. With hysteresis, as on Box Pushing, it finds the
     optimum: that is optimism about the other agent, not a richer class."""
@@ -168,22 +180,26 @@ def test_independent_learners_average_over_the_other(play):
     assert play(dec_maddrqn, "risky", hysteresis=0.2)[0] == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("game", SETTINGS)
 def test_actors_and_critics_find_the_optimum(play, game):
     """On policy: agent 1's a is best as long as agent 0 sometimes takes a, and then so is a for agent 0."""
-    settings = dict(total_timesteps=5_000, batch_size=16, exploration_timesteps=3_000, learning_rate=4e-3)
+    settings = dict(total_timesteps=4_000, batch_size=16, exploration_timesteps=2_400, learning_rate=5e-3)
     assert play(mac_iaicc, game, reward_scale=0.1, **settings)[0] == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", [avf_vdn, avf_qmix, avf_qplex], ids=lambda s: s.__name__)
 def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch, tmp_path):
     """What theory/optimism.py predicts, on a game in which nothing else matters. By hand: below beta = 0.527 it pays to
     push; for beta 0.3, 0.1 (10 - e) = 0.081 (e - 0.9 e + 3) gives e = 7.0, and for 1, 0.1 (10 - e) = 0.9 (e - 0.9 * 2
     + 3) gives -0.08."""
-    game, gamma = dict(joins=0.1, big=10.0, fails=3.0, safe=2.0), 0.9
+    game = dict(joins=0.1, big=10.0, fails=3.0, safe=2.0)
+    gamma = 0.9
     assert optimism.bound(*game.values(), gamma) == pytest.approx(0.527, abs=1e-3)
     monkeypatch.setitem(envs._TASKS, "waiting", (WaitingGame, game))
-    td_loss, found = script.td_loss, {}
+    td_loss = script.td_loss
+    found = {}
 
     def recording(*args):
         loss, q, target = td_loss(*args)
@@ -193,12 +209,27 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
         return loss, q, target
 
     monkeypatch.setattr(script, "td_loss", recording)
-    shared = dict(env="waiting", seed=SEED, runs_dir=str(tmp_path), gamma=gamma, hidden_size=16, eval_episodes=1,
-                  reward_scale=1.0, total_timesteps=8_000, learning_starts=1_600, train_frequency=16, end_e=1.0,
-                  batch_size=64, window=4, polyak=0.95, learning_rate=5e-3, exploration_timesteps=10**6)  # fmt: skip
+    shared = dict(
+        env="waiting",
+        seed=SEED,
+        runs_dir=str(tmp_path),
+        gamma=gamma,
+        hidden_size=16,
+        eval_episodes=1,
+        reward_scale=1.0,
+        total_timesteps=5_600,
+        learning_starts=1_600,
+        train_frequency=16,
+        end_e=1.0,
+        batch_size=64,
+        polyak=0.95,
+        learning_rate=0.01,
+        exploration_timesteps=10**6,
+        td_lambda=0.0,
+    )
     for beta in (0.3, 1.0):
         found[beta] = []
-        script.train(dataclasses.replace(script.parse_args(["--env=wtd-s"]), hysteresis=beta, **shared))
-        push, leave = np.mean(found[beta][-100:], 0)
+        script.train(script.Args(hysteresis=beta, **shared))
+        push, leave = np.mean(found[beta][-50:], 0)
         assert optimism.value(beta, *game.values(), gamma) == pytest.approx({0.3: 7.0, 1.0: -0.08}[beta], abs=0.01)
         assert push == pytest.approx({0.3: 7.0, 1.0: -0.08}[beta], abs=1) and leave == pytest.approx(2, abs=0.3)

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from itertools import combinations, pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +16,19 @@ from PIL import Image
 
 import envs
 import play
-import timeline
+from envs.box_pushing import PUSH, BoxPushing
 from tests.recording import scripted
 
-TINY = dict(num_envs=4, total_timesteps=1_200, learning_starts=200, train_frequency=20, batch_size=8, window=6,
-            hidden_size=16, eval_frequency=400, eval_episodes=3)  # fmt: skip
+TINY = dict(
+    num_envs=4,
+    total_timesteps=1_200,
+    learning_starts=200,
+    train_frequency=100,
+    batch_size=2,
+    hidden_size=16,
+    eval_frequency=400,
+    eval_episodes=3,
+)
 
 
 def train(name, env_id, runs_dir, **changes):
@@ -112,6 +121,25 @@ def test_agents_choose_what_their_networks_find_best(run):
     assert np.isneginf(episode.utilities[:, 0, 3:]).all(), "a robot has three macro-actions"
 
 
+@pytest.mark.parametrize("name", ["avf_qplex", "cen_maddrqn", "mac_iaicc"])
+def test_what_cannot_be_started_is_neither_chosen_nor_shown(name, tmp_path, monkeypatch):
+    """Here nobody can push but in every third step, and the environment refuses a choice that is not available."""
+
+    def can_start(self):
+        everything = np.tile(self.own_actions, (self.num_envs, 1, 1))
+        everything[:, :, PUSH] &= self.elapsed[:, None] % 3 == 0
+        return everything
+
+    monkeypatch.setattr(BoxPushing, "_can_start", can_start)
+    episode = played(train(name, "bp-10", tmp_path, total_timesteps=500))
+    steps, agents = np.nonzero(episode.chosen)
+    pushes = steps[episode.running[steps, agents] == PUSH]
+    assert (pushes % 3 == 0).all() and (steps % 3 > 0).any()
+    if name != "cen_maddrqn":
+        nothing = 0.0 if name == "mac_iaicc" else -np.inf
+        np.testing.assert_array_equal(episode.utilities[steps, agents, PUSH] == nothing, steps % 3 > 0)
+
+
 # ---- rows -----------------------------------------------------------------------------------------------------------
 def printed(lines):
     """What describe_rows says: of each row what stands left of the bar, of each agent and row what stands right."""
@@ -147,9 +175,6 @@ def test_the_rows_of_a_scripted_episode_are_the_ones_done_by_hand():
         ["1", "-", "7", "free"],
     ]
     assert printed(play.describe_rows(script, args, recorder, 2, 3)) == (rows[2:4], agents[4:8])
-    args = dataclasses.replace(args, discount="decision")
-    rows, _ = printed(play.describe_rows(script, args, recorder, 2, 2))
-    assert rows == [["2", "2", "2", "-2.0000", "0.9000"]], "gamma once a row"
     recorder.steps[-1] = recorder.steps[-1]._replace(terminated=np.array([True]))
     assert printed(play.describe_rows(script, args, recorder, 6, 6))[0] == [["6", "7", "1", "-1.0000", "0.0000"]]
     with pytest.raises(ValueError, match="the episode has rows 0 to 7"):
@@ -180,13 +205,13 @@ def test_what_an_agent_last_saw_stays_until_it_chooses():
 
 def test_what_is_printed_is_what_is_sampled_for_learning():
     script, recorder = importlib.import_module("avf_qmix"), scripted()
-    args, rng = script.Args(env="bp-10"), np.random.default_rng(0)
-    batch = play.remember(script, args, recorder.steps).sample(1, 100, "joint", rng)
+    args = script.Args(env="bp-10")
+    batch = script.make_batch([play.remember(script, args, recorder.steps)])
     rows, agents = printed(play.describe_rows(script, args, recorder, 0, 7))
     assert batch["valid"][0].tolist() == [True] * 7 + [False]
     np.testing.assert_allclose(batch["reward"][0, :7], [float(row[3]) for row in rows[:7]], atol=6e-5)
     np.testing.assert_allclose(batch["discount"][0, :7], [float(row[4]) for row in rows[:7]], atol=6e-5)
-    assert batch["chosen"][0, :7].flatten().tolist() == [agent[3] == "chosen" for agent in agents[:14]]
+    assert batch["free"][0, :7].flatten().tolist() == [agent[3] == "chosen" for agent in agents[:14]]
     names = recorder.episode().names[0]
     assert batch["action"][0, :7].flatten().tolist() == [names.index(agent[1]) for agent in agents[:14]]
 
@@ -231,8 +256,26 @@ def test_the_files_that_are_written(run, tmp_path, brief, capsys):
         assert animation.n_frames == 13 and animation.format == "GIF"
         assert animation.size == Image.fromarray(envs.make("wtd-s")._draw(0)).size
         assert whole.format == enlarged.format == "PNG"
-        assert whole.width == enlarged.width == 2 * timeline.WIDTH and whole.height < enlarged.height
+        assert whole.width == enlarged.width == 2000 and whole.height < enlarged.height
     assert sorted(path.name for path in tmp_path.iterdir()) == ["part.png", "team.GIF", "team.png"]
+
+
+def test_the_timeline_is_written_as_its_suffix_says(run, tmp_path, brief):
+    svg, pdf = tmp_path / "team.SVG", tmp_path / "team.pdf"
+    play.main([str(run), "--episodes=1", f"--timeline={svg}"])
+    play.main([str(run), "--episodes=1", f"--timeline={pdf}", "--steps=0-12"])
+    text = svg.read_text()
+    assert "wtd-s, avf_qplex</text>" in text and "A greedy episode of 12 steps, " in text
+    assert "Asynchronous: macro-actions end" in text and "<image" not in text
+    assert pdf.read_bytes().startswith(b"%PDF")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["team.SVG", "team.pdf"]
+
+
+def test_matplotlib_is_imported_only_for_a_timeline_and_without_a_window_system():
+    seen = "print([name in sys.modules for name in ('matplotlib', 'matplotlib.pyplot')])"
+    command = [sys.executable, "-c", f"import sys; import play; {seen}; import timeline; {seen}"]
+    program = subprocess.run(command, capture_output=True, text=True, cwd=Path(play.__file__).parent)
+    assert program.stdout.splitlines() == ["[False, False]", "[True, False]"], program.stderr
 
 
 def test_a_reader_that_has_seen_enough_is_no_error(run):
@@ -274,7 +317,8 @@ def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
         (["--timeline={}/team.png", "--steps=4"], "--steps must be two times, the second after the first"),
         (["--timeline={}/team.png", "--steps=4-4"], "--steps must be two times, the second after the first"),
         (["--timeline={}/team.png", "--steps=0-13"], "--steps 0-13 is out of range: the episode has 12 steps"),
-        (["--timeline={}/team.jpg"], "cannot write .*jpg: it has to be a .png file"),
+        (["--timeline={}/team.jpg"], "cannot write .*jpg: it has to be a .png or .svg or .pdf file in a folder that"),
+        (["--timeline={}/missing/team.pdf"], "cannot write .*team.pdf: it has to be a .png or .svg or .pdf file in a"),
         (["--gif={}/missing/team.gif"], "cannot write .*missing/team.gif: it has to be a .gif file in a folder that"),
     ],
 )
@@ -288,21 +332,25 @@ def test_bad_options_end_with_one_line_and_leave_files_alone(run, tmp_path, brie
     assert sorted(tmp_path.iterdir()) == before and (tmp_path / "team.png").read_text() == "kept"
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     path = tmp_path / "team.png"
     path.write_text("kept")
 
-    def broken(self, file, kind, **options):
+    def broken(file):
         file.write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(Image.Image, "save", broken)
     with pytest.raises(SystemExit, match=r"^play: cannot write .*team.png: disk full"):
-        play.write(str(path), Image.new("RGB", (2, 2)), "PNG")
-    monkeypatch.undo()
+        play.write(str(path), broken)
+
+    def too_large(file):
+        raise ValueError("Image size is too large")
+
+    with pytest.raises(SystemExit, match=r"^play: cannot write .*team.png: Image size is too large"):
+        play.write(str(path), too_large)
     (tmp_path / "folder.png").mkdir()
     with pytest.raises(SystemExit, match=r"^play: cannot write .*folder.png: "):
-        play.write(str(tmp_path / "folder.png"), Image.new("RGB", (2, 2)), "PNG")
+        play.write(str(tmp_path / "folder.png"), lambda file: file.write_bytes(b"whole"))
     assert sorted(file.name for file in tmp_path.iterdir()) == ["folder.png", "team.png"]
     assert path.read_text() == "kept"
 

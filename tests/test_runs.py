@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import multiprocessing
 import os
 import re
 import runpy
@@ -20,10 +21,11 @@ import avf_qplex
 import envs
 from avf_qplex import Args, load, parse_args, save, train
 from tests.curves import scalars
-from tests.rollouts import TINY, Spy, args_for
-from tests.sync import SCRIPTS
+from tests.short_runs import CHARTS, EVAL, REPLAY, SHORT, cut_episodes, short
+from tests.sync import ROOT, SCRIPTS
 
-ROOT = Path(__file__).parents[1]
+TINY = {**SHORT, **REPLAY}
+TASKS = dict(zip(SCRIPTS, ("ct-10", "bp-10", "wtd-s", "wtd-s", "ct-10", "bp-10"), strict=True))  # one for each script
 
 
 def flags(options):
@@ -31,67 +33,78 @@ def flags(options):
 
 
 def start(script, *arguments):
-    """The script in a process of its own."""
+    """The script as a program in a process of its own."""
     command = [sys.executable, str(ROOT / f"{script}.py"), *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    return subprocess.Popen(command, cwd=ROOT, env=environment, text=True, **pipes)
+    return subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def run_as_program(monkeypatch, *arguments, script="avf_qplex"):
-    """The script as a program, in this process: the exit code and what it says last, as the interpreter would."""
+    """The script as a program in this process: the exit code, and what the interpreter would print at last."""
     monkeypatch.setattr(sys, "argv", [f"{script}.py", *map(str, arguments)])
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         runpy.run_path(str(ROOT / f"{script}.py"), run_name="__main__")
         return 0, ""
     except SystemExit as stopped:
-        code = stopped.code
-        return (code, "") if isinstance(code, int) else (1, str(code))
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        return (stopped.code, "") if isinstance(stopped.code, int) else (1, str(stopped.code))
 
 
 def one_line(text):
     return bool(text) and "\n" not in text.strip() and "Traceback" not in text
 
 
-def stop_in(monkeypatch, module, steps):
-    """A list of signals, in which one arrives in that step of training."""
-    stop, act, taken = [], module.act, []
+def wait_for(condition):
+    for _ in range(2_400):
+        if condition():
+            return
+        time.sleep(0.025)
+    raise TimeoutError
+
+
+def interrupt_at(monkeypatch, module, steps):
+    """Ctrl-C arrives in this step of training. What was logged up to it is written."""
+    act, writer_class = module.act, module.SummaryWriter
+    taken = []
+    writers = []
 
     def counted(*args):
-        taken.extend([1] * (len(args) > 4))  # evaluation gives neither epsilon nor generator
-        stop.extend([signal.SIGINT] * (len(taken) == steps))
+        taken.extend([1] * (len(args) > 4))  # evaluation gives neither epsilon nor a generator
+        if len(taken) == steps:
+            writers[-1].close()
+            raise KeyboardInterrupt
         return act(*args)
 
+    def noted(*args, **kwargs):
+        writers.append(writer_class(*args, **kwargs))
+        return writers[-1]
+
     monkeypatch.setattr(module, "act", counted)
-    return stop
+    monkeypatch.setattr(module, "SummaryWriter", noted)
 
 
-class ArrivesAt:
-    """In the place of the list of signals: one arrives just before the n-th time that somebody looks."""
-
-    def __init__(self, look):
-        self.looks_left = look
-
-    def __bool__(self):
-        self.looks_left -= 1
-        return self.looks_left <= 0
-
-
-def reached(folder):
-    """The step of a run's checkpoint."""
-    return torch.load(folder / "checkpoint.pt", weights_only=True)["counts"][0]
+def interrupted(monkeypatch, module, args, steps):
+    """The folder of a run to which Ctrl-C comes in this step."""
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, module, steps)
+        with pytest.raises(KeyboardInterrupt):
+            module.train(args)
+    (folder,) = Path(args.runs_dir).iterdir()
+    return folder
 
 
-def same_run(one, other):
-    """Every logged number and every weight of two run folders."""
+def resume(module, folder):
+    """Goes on with a run, but not in the second in which it began: TensorBoard orders its files by the second."""
+    began = max(int(path.name.split(".")[3]) for path in folder.glob("events.*"))
+    wait_for(lambda: time.time() >= began + 1)
+    assert module.train(module.parse_args([f"--resume={folder}"])) == folder
+    assert not (folder / "checkpoint.pt").exists()
+
+
+def assert_same_run(one, other):
+    """Every logged number and every weight of two run folders is the same."""
     expected, got = scalars(one), scalars(other)
     assert expected.keys() == got.keys()
     for tag in expected:
-        assert dict(got[tag]) == dict(expected[tag]), tag
+        assert got[tag] == expected[tag], tag
     for name in ("last.pt", "best.pt"):
         models = [torch.load(folder / name, weights_only=True) for folder in (one, other)]
         assert models[0]["step"] == models[1]["step"], name
@@ -99,84 +112,162 @@ def same_run(one, other):
             assert torch.equal(value, models[1]["networks"][key]), f"{name} {key}"
 
 
-@pytest.mark.parametrize(
-    "script, env_id, number",
-    [
-        ("avf_qplex", "wtd-s", signal.SIGKILL),
-        ("avf_qmix", "bp-10", signal.SIGTERM),
-        ("avf_vdn", "ct-10", signal.SIGINT),
-    ],
-)
-def test_killed_and_resumed_equals_undisturbed(tmp_path, script, env_id, number):
-    """A kill takes the process down wherever it is, an interrupt between two steps."""
+def reached(folder):
+    """The step of a run's checkpoint."""
+    return torch.load(folder / "checkpoint.pt", weights_only=True)["progress"][0]
+
+
+# ---- killed, interrupted and resumed --------------------------------------------------------------------------------
+def train_in_process(script, args):
     module = importlib.import_module(script)
-    steps = {"wtd-s": 1_600, "bp-10": 4_000, "ct-10": 1_600}[env_id]
-    options = {**TINY, "total_timesteps": steps, "buffer_size": 8, "exploration_timesteps": 400}
-    undisturbed = module.train(args_for(module, env_id, seed=5, runs_dir=str(tmp_path / "whole"), **options))
-    # Checkpoints at every step where the process is killed, so that it happens in the middle of one as well.
-    frequency = 0.0 if number == signal.SIGKILL else 60.0
-    process = start(script, f"--env={env_id}", "--seed=5", f"--runs-dir={tmp_path / 'cut'}",
-                    f"--checkpoint-frequency={frequency}", *flags(options))  # fmt: skip
-    for _ in range(2_400):  # after the first evaluation
-        if any((tmp_path / "cut").glob("*/last.pt")) and (frequency or any((tmp_path / "cut").glob("*/checkpoint.pt"))):
-            break
-        assert process.poll() is None, process.communicate()[1]
-        time.sleep(0.025)
-    process.send_signal(number)
-    printed, errors = process.communicate(timeout=60)
+    module.train(args)
+
+
+@pytest.fixture(scope="module")
+def processes():
+    """Processes that begin with what takes long to import: PyTorch, and what its optimisers import at first use."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torch", "torch._dynamo", "torch.utils.tensorboard", "gymnasium", "tyro"])
+    return context
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_killed_and_resumed_equals_undisturbed(tmp_path, processes, script):
+    """With checkpoints at every step, so that the kill may come in the middle of one, too."""
+    module = importlib.import_module(script)
+    options = dict(seed=5, exploration_timesteps=400, total_timesteps=800, eval_frequency=200)
+    undisturbed = module.train(short(module, TASKS[script], tmp_path / "whole", **options))
+    args = short(module, TASKS[script], tmp_path / "cut", checkpoint_frequency=0.0, **options)
+    process = processes.Process(target=train_in_process, args=(script, args))
+    process.start()
+    wait_for(lambda: any(tmp_path.glob("cut/*/last.pt")) or not process.is_alive())  # after the first evaluation
+    process.kill()
+    process.join()
     (folder,) = (tmp_path / "cut").iterdir()
-    assert process.returncode == (-number if number == signal.SIGKILL else 128 + number)
-    if number != signal.SIGKILL:
-        assert printed == f"{folder}\n" and f"go on with: python {script}.py --resume {folder}" in errors
-    cut_at = reached(folder)
-    assert 0 < cut_at < steps, "the run was cut before its end"
-    time.sleep(1.1)  # TensorBoard orders event files by the second in which they were made
-    assert module.train(module.parse_args([f"--resume={folder}"])) == folder
-    same_run(undisturbed, folder)
-    assert not (folder / "checkpoint.pt").exists()
+    assert process.exitcode == -signal.SIGKILL and 0 < reached(folder) < 800, "the run was cut before its end"
+    resume(module, folder)
+    assert_same_run(undisturbed, folder)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_stopped_and_resumed_equals_undisturbed(tmp_path, monkeypatch, script):
-    """In this process, for each script; learning goes on where it was, with what was in the replay memory."""
+def test_interrupted_and_resumed_equals_undisturbed(tmp_path, monkeypatch, script):
+    """Ctrl-C comes at step 720 of 1,000, the last checkpoint is of step 616, and episodes have ended in between.
+
+    The clock moves on by a second whenever somebody looks at it, which is once a step, and once a checkpoint.
+    """
     module = importlib.import_module(script)
-    options = {key: value for key, value in TINY.items() if hasattr(module.Args, key)}
-    options |= dict(learning_rate_end=0.0, total_timesteps=1_200, train_frequency=20)
-    options |= dict(exploration_timesteps=400)  # random macro-actions would not tell what the networks remember
-    if script == "mac_iaicc":
-        options = {key: value for key, value in options.items() if key != "train_frequency"} | dict(batch_size=4)
-    undisturbed = module.train(args_for(module, "bp-10", seed=0, runs_dir=str(tmp_path / "whole"), **options))
-    args = args_for(module, "bp-10", seed=0, runs_dir=str(tmp_path / "cut"), **options)
-    folder = module.train(args, stop_in(monkeypatch, module, 130))
-    assert reached(folder) == 520
-    monkeypatch.undo()
-    time.sleep(1.1)  # TensorBoard orders event files by the second in which they were made
-    remembered, acted = module.load(folder / "checkpoint.pt")["hidden"], Spy(monkeypatch, module, "act")
-    assert module.train(module.parse_args([f"--resume={folder}"])) == folder
-    assert remembered.any() and torch.equal(acted.calls[0].hidden, remembered)
-    same_run(undisturbed, folder)
+    cut_episodes(monkeypatch, 17)
+    options = dict(seed=0, exploration_timesteps=400, total_timesteps=1_000, eval_frequency=200)
+    undisturbed = module.train(short(module, TASKS[script], tmp_path / "whole", **options))
+    args = short(module, TASKS[script], tmp_path / "cut", checkpoint_frequency=50.0, **options)
+    seconds = iter(range(10_000))
+    with monkeypatch.context() as patch:
+        clock = types.SimpleNamespace(monotonic=lambda: next(seconds), time_ns=time.time_ns)
+        patch.setattr(module, "time", clock)
+        folder = interrupted(patch, module, args, steps=180)
+    assert reached(folder) == 616
+    stale = scalars(folder)
+    assert stale["charts/episodic_return"][-1][0] > 616, "what was logged after the checkpoint is dropped below"
+    remembered = module.load(folder / "checkpoint.pt")["hidden"]
+    acted = []
+    act = module.act
+
+    def noted(agents, obs, infos, hidden, *others):
+        acted.append(hidden)
+        return act(agents, obs, infos, hidden, *others)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "act", noted)
+        resume(module, folder)
+    assert remembered.any() and torch.equal(acted[0], remembered)
+    assert_same_run(undisturbed, folder)
 
 
-def test_a_run_that_is_stopped_before_its_first_step_can_go_on(tmp_path):
-    """Or it would look like one that is finished, with no model in it."""
-    folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY), [signal.SIGINT])
-    assert reached(folder) <= TINY["num_envs"] and not (folder / "last.pt").exists()
-    assert train(parse_args([f"--resume={folder}"])) == folder and (folder / "last.pt").exists()
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_program_that_is_stopped(tmp_path, monkeypatch, number):
+    """Ctrl-C ends it with one line and code 130, SIGTERM ends it at once. The checkpoint is whole, and it can go on."""
+    options = {**TINY, "runs_dir": tmp_path, "checkpoint_frequency": 0, "total_timesteps": 100_000}
+    process = start("avf_vdn", "--env=bp-10", *flags(options))
+    wait_for(lambda: any(tmp_path.glob("*/checkpoint.pt")) or process.poll() is not None)
+    process.send_signal(number)
+    printed, errors = process.communicate(timeout=60)
+    (folder,) = tmp_path.iterdir()
+    said = [line for line in errors.splitlines() if not line.startswith("step ")]  # but for evaluations
+    if number == signal.SIGINT:
+        assert process.returncode == 130 and printed == f"{folder}\n"
+        assert said == ["stopped; --resume with the run's folder goes on from its last checkpoint"]
+    else:
+        assert process.returncode == -signal.SIGTERM and not said
+    saved = importlib.import_module("avf_vdn").load(folder / "checkpoint.pt")
+    assert saved["progress"][0] >= 4 and saved["args"]["total_timesteps"] == 100_000
 
 
-@pytest.mark.parametrize("look", [1, 3, 5])
-def test_a_stop_is_never_without_a_checkpoint_of_its_step(tmp_path, monkeypatch, look):
-    """Wherever the signal arrives: here just before each of the first times that the loop looks for it."""
-    acted = Spy(monkeypatch, avf_qplex, "act")
-    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY)
-    folder = train(args, ArrivesAt(look))
-    assert reached(folder) == 4 * len(acted.calls)
+def test_there_is_a_checkpoint_from_the_first_step_on(tmp_path, monkeypatch):
+    """Here Ctrl-C comes in the second step, and the run goes on as if nothing had happened."""
+    cut_episodes(monkeypatch, 25)
+    undisturbed = train(short(avf_qplex, "bp-10", tmp_path / "whole", total_timesteps=400))
+    args = short(avf_qplex, "bp-10", tmp_path / "cut", total_timesteps=400)
+    folder = interrupted(monkeypatch, avf_qplex, args, steps=2)
+    assert reached(folder) == 4 and not (folder / "last.pt").exists()
+    resume(avf_qplex, folder)
+    assert_same_run(undisturbed, folder)
 
 
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_checkpoint_holds_the_rows_that_were_written_alone(tmp_path, monkeypatch, script):
+    """Not the whole buffer, in which a long episode has its room reserved."""
+    module = importlib.import_module(script)
+    cut_episodes(monkeypatch, 20_000)
+    buffers = []
+    buffer_class = getattr(module, "ReplayBuffer", None) or module.EpisodeBuffer
+    begin_rows = buffer_class.begin_rows
+
+    def spy_begin_rows(self, *args, **kwargs):
+        buffers[:] = [self]
+        begin_rows(self, *args, **kwargs)
+
+    monkeypatch.setattr(buffer_class, "begin_rows", spy_begin_rows)
+    args = short(module, "ct-10", tmp_path, checkpoint_frequency=0.0, eval_frequency=10**6)
+    folder = interrupted(monkeypatch, module, args, steps=30)
+    (buffer,) = buffers
+    assert buffer.running.nbytes > 5_000_000 and buffer.running_rows.max() == 29
+    assert (folder / "checkpoint.pt").stat().st_size < 1_000_000
+    saved = module.load(folder / "checkpoint.pt")["buffer"]
+    row = buffer.running.dtype.itemsize
+    assert [len(rows) for rows in saved["running"]] == [row * length for length in buffer.running_rows]
+    assert [len(rows) for rows in saved["ended"]] == [row * len(episode) for episode in buffer.ended]
+
+
+def test_a_kill_costs_at_most_a_minute(tmp_path, monkeypatch):
+    """By default a checkpoint is written every minute, here by a clock that moves on by 7 s in each step."""
+    assert all(importlib.import_module(script).Args.checkpoint_frequency == 60 for script in SCRIPTS)
+    seconds = [0.0]
+    saved_at = []
+    act, save = avf_qplex.act, avf_qplex.save
+
+    def slow_act(*args):
+        seconds[0] += 7.0 * (len(args) > 4)  # a step of training, not of evaluation
+        return act(*args)
+
+    def spy_save(path, *args, **content):
+        saved_at.extend([seconds[0]] * (path.name == "checkpoint.pt"))
+        save(path, *args, **content)
+
+    clock = types.SimpleNamespace(monotonic=lambda: seconds[0], time_ns=time.time_ns)
+    monkeypatch.setattr(avf_qplex, "time", clock)
+    monkeypatch.setattr(avf_qplex, "act", slow_act)
+    monkeypatch.setattr(avf_qplex, "save", spy_save)
+    train(short(avf_qplex, "bp-10", tmp_path, total_timesteps=200))
+    assert saved_at == [7.0 + 63.0 * number for number in range(6)], "over 60 s is after nine steps"
+
+
+# ---- what a run leaves ----------------------------------------------------------------------------------------------
 def test_a_finished_run(tmp_path, monkeypatch, capsys):
-    """What is in its folder, what it printed, and that it cannot be resumed."""
-    code, _ = run_as_program(monkeypatch, "--env=bp-10", "--seed=3", f"--runs-dir={tmp_path}",
-                             "--checkpoint-frequency=0.05", *flags(TINY))  # fmt: skip
+    """What it printed, what is in its folder, and that it cannot be resumed."""
+    options = {**TINY, "seed": 3, "runs_dir": tmp_path, "checkpoint_frequency": 0.05}
+    code, _ = run_as_program(monkeypatch, "--env=bp-10", *flags(options))
     printed = capsys.readouterr()
     (folder,) = tmp_path.iterdir()
     assert code == 0 and printed.out == f"{folder}\n" and folder.name.startswith("bp-10__avf_qplex__3__")
@@ -186,56 +277,36 @@ def test_a_finished_run(tmp_path, monkeypatch, capsys):
     assert names == {"args.json", "best.pt", "last.pt", "events.out"}
     saved = json.loads((folder / "args.json").read_text())
     assert saved.pop("algorithm") == "avf_qplex"
-    args = args_for(avf_qplex, "bp-10", seed=3, runs_dir=str(tmp_path), checkpoint_frequency=0.05, **TINY)
+    args = short(avf_qplex, "bp-10", tmp_path, seed=3, checkpoint_frequency=0.05)
     assert Args(**saved) == args
     last, best, curve = load(folder / "last.pt"), load(folder / "best.pt"), scalars(folder)
     assert last["step"] == 1_200 and last["return"] == pytest.approx(curve["eval/return"][-1][1])
     assert best["return"] == pytest.approx(max(value for _, value in curve["eval/return"]), rel=1e-6)
     assert Args(**last["args"]) == Args(**best["args"]) == args
-    assert {"charts/episodic_return", "charts/epsilon"} - curve.keys() <= {"charts/episodic_return", "charts/epsilon"}
-    assert {f"eval/{key}" for key in ("return", "discounted_return", "length", "success")} <= curve.keys()
     code, message = run_as_program(monkeypatch, f"--resume={folder}")
     assert code == 1 and one_line(message) and message.startswith(f"cannot read {folder}/checkpoint.pt: ")
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_discount_for_each_step_or_once_a_row(tmp_path, monkeypatch, script):
-    """What is learned from: gamma^tau and rewards discounted within a row, or gamma and their sum."""
-    module = importlib.import_module(script)
-    over_rows, rows = module.over_rows, {}
-
-    def spy(batch, *networks):
-        if "reward" in batch:  # not the critics' joint batch of mac_iaicc
-            rows[discount] += torch.stack([batch["discount"], batch["reward"]], 2)[batch["valid"]].tolist()
-        return over_rows(batch, *networks)
-
-    monkeypatch.setattr(module, "over_rows", spy)
-    options = {key: value for key, value in TINY.items() if hasattr(module.Args, key)} | dict(gamma=0.9, reward_scale=1)
-    for discount in ("step", "decision"):
-        rows[discount] = []
-        module.train(args_for(module, "bp-10", runs_dir=str(tmp_path), discount=discount, **options))
-    walks = [row for row in rows["step"] if row[0] < 0.9 and -1 < row[1] < 0]  # some steps at -0.1, nothing else
-    assert walks and all(reward == pytest.approx(once - 1, abs=1e-5) for once, reward in walks)
-    walks = [row for row in rows["decision"] if -1 < row[1] < 0]
-    assert min(reward for _, reward in walks) < -0.25 and all(once == pytest.approx(0.9) for once, _ in walks)
-    assert all(reward * 10 == pytest.approx(round(reward * 10), abs=1e-4) for _, reward in walks)
-
-
-def test_what_is_logged(tmp_path):
-    """Of training every 2,000 steps, of the loss every 100 updates, and evaluations at the end in any case."""
-    options = {**TINY, "total_timesteps": 4_100, "train_frequency": 20, "learning_starts": 2_000}
-    curve = scalars(train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**options, "eval_frequency": 2_050})))
-    assert [step for step, _ in curve["charts/episodic_return"]] == [2_000, 4_000]
-    assert [step for step, _ in curve["eval/return"]] == [2_052, 4_100]
-    for key in ("td_loss", "q_values", "grad_norm"):
-        assert [step for step, _ in curve[f"losses/{key}"]] == [4_000], key
+def test_what_is_logged(tmp_path, monkeypatch):
+    """Returns when episodes end, losses every 100 updates, evaluations when their time is passed and at the end."""
+    cut_episodes(monkeypatch, 25)
+    options = dict(total_timesteps=1_230, num_envs=6, train_frequency=8, learning_starts=120, eval_frequency=500)
+    run = train(short(avf_qplex, "wtd-s", tmp_path, batch_size=2, **options))
+    curve = scalars(run)
+    losses = {"losses/td_loss", "losses/q_values", "losses/grad_norm"}
+    assert curve.keys() == CHARTS | EVAL | losses
+    assert [step for step, _ in curve["charts/episodic_return"]] == list(range(150, 1_230, 150))
+    for name in EVAL | {"charts/epsilon"}:
+        assert [step for step, _ in curve[name]] == [504, 1_002, 1_230], name
+    for name in losses:  # there are updates from step 150 on, when the first episodes end, at 152, 160, 168, ...
+        assert [step for step, _ in curve[name]] == [948], name
 
 
 def test_best_is_the_best_and_the_latest_of_equals(tmp_path, monkeypatch):
     returns = iter([1.0, 3.0, 2.0, 3.0, 0.5, 1.0])
     result = {"discounted_return": np.zeros(2), "length": np.ones(2), "success": np.zeros(2)}
-    monkeypatch.setattr(avf_qplex, "evaluate", lambda *args: result | {"return": np.full(2, next(returns))})
-    folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**TINY, "eval_frequency": 200}))
+    monkeypatch.setattr(avf_qplex, "evaluate", lambda *args, seed: result | {"return": np.full(2, next(returns))})
+    folder = train(short(avf_qplex, "wtd-s", tmp_path, eval_frequency=200))
     best, last = load(folder / "best.pt"), load(folder / "last.pt")
     assert (best["step"], best["return"]) == (800, 3.0) and (last["step"], last["return"]) == (1_200, 1.0)
     assert any(not torch.equal(value, last["networks"][key]) for key, value in best["networks"].items())
@@ -244,66 +315,65 @@ def test_best_is_the_best_and_the_latest_of_equals(tmp_path, monkeypatch):
 def test_the_best_model_outlives_a_resume(tmp_path, monkeypatch):
     returns = iter([3.0, 2.0, 1.0])
     result = {"discounted_return": np.zeros(2), "length": np.ones(2), "success": np.zeros(2)}
-    monkeypatch.setattr(avf_qplex, "evaluate", lambda *args: result | {"return": np.full(2, next(returns))})
-    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY)
-    folder = train(args, stop_in(monkeypatch, avf_qplex, 120))
-    train(parse_args([f"--resume={folder}"]))
-    assert load(folder / "best.pt")["step"] == 400 and load(folder / "last.pt")["step"] == 1_200
+    monkeypatch.setattr(avf_qplex, "evaluate", lambda *args, seed: result | {"return": np.full(2, next(returns))})
+    args = short(avf_qplex, "bp-10", tmp_path, total_timesteps=300, eval_frequency=100, checkpoint_frequency=0.0)
+    folder = interrupted(monkeypatch, avf_qplex, args, steps=30)
+    resume(avf_qplex, folder)
+    assert load(folder / "best.pt")["step"] == 100 and load(folder / "last.pt")["step"] == 300
 
 
-def test_a_kill_costs_at_most_a_minute(tmp_path, monkeypatch):
-    """By default a checkpoint is written every minute: with a clock that moves on by 7 s at each step."""
-    assert Args.checkpoint_frequency <= 60 and all(
-        importlib.import_module(script).Args.checkpoint_frequency <= 60 for script in SCRIPTS
-    )
-    clock, saved_at = [1e9], []
-    monkeypatch.setattr(avf_qplex, "time", types.SimpleNamespace(time=lambda: clock[0], time_ns=time.time_ns))
-    saves, acted = Spy(monkeypatch, avf_qplex, "save"), avf_qplex.act
+def test_evaluations_are_seeded_freshly_and_apart_from_training(tmp_path, monkeypatch):
+    """No two evaluations of a run have one seed, and no two runs either; the environments of training have another."""
+    seeds = []
+    reset = envs.MacroVectorEnv.reset
 
-    def act(*args):
-        clock[0] += 7 * (len(args) > 4)  # a step of training, not of evaluation
-        saved_at.extend([clock[0]] * (len([c for c in saves.calls if c.path.name == "checkpoint.pt"]) - len(saved_at)))
-        return acted(*args)
+    def spy_reset(self, *, seed=None, options=None):
+        seeds.extend([] if seed is None else [seed])
+        return reset(self, seed=seed, options=options)
 
-    monkeypatch.setattr(avf_qplex, "act", act)
-    train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 400}))
-    times = np.array([1e9, *saved_at])
-    assert len(saved_at) >= 700 // 70 and np.diff(times).max() <= 60 + 2 * 7
-    assert 1e9 + 700 - times[-1] <= 60 + 2 * 7
+    cut_episodes(monkeypatch, 10)
+    monkeypatch.setattr(envs.MacroVectorEnv, "reset", spy_reset)
+    for script in ("avf_vdn", "mac_iaicc"):
+        module = importlib.import_module(script)
+        for seed in (0, 1):
+            seeds.clear()
+            module.train(short(module, "bp-10", tmp_path, seed=seed, total_timesteps=60, eval_frequency=20))
+            state = np.random.SeedSequence(seed).generate_state(5, np.uint64).tolist()
+            own = state[3:] if script == "avf_vdn" else state[2:4]  # of the environments and of the evaluations
+            assert seeds == [own[0], own[1] + 20, own[1] + 40, own[1] + 60]
 
 
 def test_runs_never_share_a_folder(tmp_path, monkeypatch):
-    """Two of the same microsecond: the second is refused in one line, and the first is left as it is."""
-    monkeypatch.setattr(avf_qplex, "time", types.SimpleNamespace(time=time.time, time_ns=lambda: 123_456))
-    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **{**TINY, "total_timesteps": 40})
-    folder = train(args)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(FileExistsError):  # which the program turns into one line
-        train(args)
+    """Not even those of the same microsecond: of one seed the second is refused, and the first is left as it is."""
+    cut_episodes(monkeypatch, 10)
+    options = dict(total_timesteps=40)
+    with monkeypatch.context() as patch:
+        patch.setattr(avf_qplex, "time", types.SimpleNamespace(monotonic=time.monotonic, time_ns=lambda: 123_456))
+        folder = train(short(avf_qplex, "bp-10", tmp_path, seed=1, **options))
+        assert train(short(avf_qplex, "bp-10", tmp_path, seed=2, **options)) != folder
+        before = {path.name: path.read_bytes() for path in folder.iterdir()}
+        with pytest.raises(FileExistsError):  # which the program turns into one line
+            train(short(avf_qplex, "bp-10", tmp_path, seed=1, **options))
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-    monkeypatch.undo()
-    assert len({train(args) for _ in range(3)} | {folder}) == 4
+    runs = {train(short(avf_qplex, "bp-10", tmp_path, seed=1, **options)) for _ in range(3)}
+    assert len(runs | {folder}) == 4
 
 
-def test_a_task_in_a_module_of_its_own(tmp_path):
-    """Found through --env module:id, trained and played, each in a process of its own."""
-    module = (
-        "import envs\nfrom tests.matrix_game import MatrixGame\n\nenvs.register('my-task', MatrixGame, tell=True)\n"
-    )
+def test_a_task_in_a_module_of_its_own(tmp_path, monkeypatch):
+    """It is found through --env module:id. A family's defaults are not for it, and no folder's name has a colon."""
+    module = "import envs\nfrom envs.box_pushing import BoxPushing\n\nenvs.register('bp-mine', BoxPushing, grid=6)\n"
     (tmp_path / "my_module.py").write_text(module)
-    path = os.pathsep.join([str(ROOT), str(tmp_path)])
-    tiny = dict(total_timesteps=400, learning_starts=100, num_envs=4, eval_episodes=2, hidden_size=8, runs_dir=tmp_path)
-    command = [sys.executable, ROOT / "avf_qmix.py", "--env=my_module:my-task", *flags(tiny)]
-    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=True)
-    folder = done.stdout.strip()
-    assert Path(folder).name.startswith("my_module:my-task__avf_qmix__1__")
-    command = [sys.executable, ROOT / "play.py", folder, "--episodes=2"]
-    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("my_module:my-task avf_qmix best model of step 400: 2 greedy episodes")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert parse_args(["--env=my_module:bp-mine"]) == Args(env="my_module:bp-mine")
+    assert parse_args(["--env=bp-mine"]) == Args(env="bp-mine", **avf_qplex.DEFAULTS["bp-"])
+    folder = train(short(avf_qplex, "my_module:bp-mine", tmp_path / "runs", total_timesteps=400))
+    assert folder.name.startswith("my_module-bp-mine__avf_qplex__1__") and ":" not in folder.name
+    assert load(folder / "last.pt")["args"]["env"] == "my_module:bp-mine"
 
 
+# ---- the command line -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
-    "arguments, message",
+    ("arguments", "message"),
     [
         (["--env=wtd-x"], "--env: unknown environment 'wtd-x' (did you mean 'wtd-t'?); valid ids: bp-10 bp-20"),
         (["--env=no_such_module:my-task"], "--env: No module named 'no_such_module'"),
@@ -313,17 +383,13 @@ def test_a_task_in_a_module_of_its_own(tmp_path):
         (["--polyak=1.01"], "--polyak must be from 0 to 1, got 1.01"),
         (["--td-lambda=2"], "--td-lambda must be from 0 to 1, got 2.0"),
         (["--hysteresis=-1"], "--hysteresis must be from 0 to 1, got -1.0"),
-        (["--learning-rate=-1"], "--learning-rate must be from 0 to 1, got -1.0"),
         (["--learning-rate=nan"], "--learning-rate must be from 0 to 1, got nan"),
-        (["--learning-rate-end=-1"], "--learning-rate-end must be from 0 to 1, got -1.0"),
-        (["--reward-scale=-1"], "--reward-scale must be from 0 to inf, got -1.0"),
-        (["--max-grad-norm=nan"], "--max-grad-norm must be from 0 to inf, got nan"),
-        (["--checkpoint-frequency=-1"], "--checkpoint-frequency must be from 0 to inf, got -1.0"),
-        (["--batch-size=0"], "--batch-size must be from 1 to inf, got 0"),
-        (["--num-envs=0"], "--num-envs must be from 1 to inf, got 0"),
-        (["--window=0"], "--window must be from 1 to inf, got 0"),
-        (["--seed=-1"], "--seed must be from 0 to inf, got -1"),
-        (["--learning-starts=-1"], "--learning-starts must be from 0 to inf, got -1"),
+        (["--max-grad-norm=nan"], "--max-grad-norm must be from 0 to 1000000000000000, got nan"),
+        (["--reward-scale=inf"], "--reward-scale must be from 0 to 1000000000000000, got inf"),
+        (["--checkpoint-frequency=-inf"], "--checkpoint-frequency must be from 0 to 1000000000000000, got -inf"),
+        (["--batch-size=0"], "--batch-size must be from 1 to 1000000000000000, got 0"),
+        (["--seed=-1"], "--seed must be from 0 to 1000000000000000, got -1"),
+        (["--learning-starts=-1"], "--learning-starts must be from 0 to 1000000000000000, got -1"),
         (["--resume=nowhere"], "cannot read nowhere/checkpoint.pt: "),
         (["--resume=nowhere", "--gamma=0.5"], "no other flag can be given with it"),
         (["--env=bp-10", "--resume=nowhere"], "no other flag can be given with it"),
@@ -340,76 +406,101 @@ def test_bad_arguments_are_told_in_one_line(tmp_path, monkeypatch, arguments, me
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_script_checks_its_arguments(script):
+def test_every_script_checks_its_numbers(script):
     module = importlib.import_module(script)
-    for field, value in module.Args.__dataclass_fields__.items():
-        if value.type in (int, float, float | None):
-            with pytest.raises(SystemExit, match=f"--{field.replace('_', '-')} must be from [01] to (1|inf), got -2"):
-                module.Args(**{field: value.type(-2) if value.type in (int, float) else -2.0})
+    fields = module.Args.__dataclass_fields__.values()
+    numbers = {field.name: field.type for field in fields if field.type in (int, float)}
+    assert len(numbers) > 15
+    for name, kind in numbers.items():
+        for value in [-2] if kind is int else [-2.0, float("nan"), float("inf")]:
+            with pytest.raises(SystemExit, match=rf"--{name.replace('_', '-')} must be from [01] to \d+, got {value}"):
+                module.Args(**{name: value})
+        if kind is float:
+            module.Args(**{name: 0.0})
     assert module.parse_args(["--seed=0"]) == module.Args(seed=0)
-    for start, changes in module.DEFAULTS.items():
-        ids = [env_id for env_id in envs.IDS if env_id.startswith(start)]
-        assert ids and all(module.parse_args([f"--env={i}"]) == module.Args(env=i, **changes) for i in ids), start
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_tasks_have_the_values_of_the_family_in_which_they_are(script):
+    module = importlib.import_module(script)
+    for beginning, values in module.DEFAULTS.items():
+        ids = [env_id for env_id in envs.IDS if env_id.startswith(beginning)]
+        assert ids and all(module.parse_args([f"--env={i}"]) == module.Args(env=i, **values) for i in ids), beginning
+    given = module.parse_args(["--env", "ct-10", "--gamma", "0.5", "--no-anneal-lr"])
+    assert given == module.Args(**{"env": "ct-10", **module.DEFAULTS["ct-"], "gamma": 0.5, "anneal_lr": False})
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_help_says_what_each_setting_does_and_its_value_for_the_task(script, capsys):
+    """The text of a setting is the comment behind it."""
+    module = importlib.import_module(script)
+    comments = re.findall(r"^    (\w+): .+? = .+?  # (.+)$", (ROOT / f"{script}.py").read_text(), re.M)
+    assert [name for name, _ in comments] == list(module.Args.__dataclass_fields__)
+    for env_id in ("bp-10", "wtd-s", "ct-10"):
+        with pytest.raises(SystemExit) as stopped:
+            module.parse_args(["--env", env_id, "--help"])
+        text = "".join(capsys.readouterr().out.replace("│", " ").split())  # without the box and its line breaks
+        args = module.parse_args(["--env", env_id])
+        assert stopped.value.code == 0
+        for name, comment in comments:
+            value = getattr(args, name)
+            assert f"--{name.replace('_', '-')}" in text, name
+            assert f"{comment}(default:{value})".replace(" ", "") in text, name
 
 
 def test_unknown_flags_and_values_are_refused(capsys):
-    for arguments in (["--gama=0.9"], ["--evaluate=x"], ["--device=abacus"], ["--batch-size=many"], ["bp-10"]):
+    removed = ["--discount=step", "--window=8", "--learning-rate-end=0"]
+    for argument in (*removed, "--gama=0.9", "--evaluate=x", "--device=abacus", "--batch-size=many", "bp-10"):
         with pytest.raises(SystemExit) as stopped:
-            parse_args(arguments)
+            parse_args([argument])
         assert stopped.value.code == 2 and not capsys.readouterr().out
-    if not torch.cuda.is_available():
-        with pytest.raises(SystemExit, match="--device cuda: there is none"):
-            parse_args(["--device=cuda"])
 
 
-def test_help_shows_the_defaults_in_force(capsys):
-    for env_id in ("bp-10", "wtd-s", "ct-10"):
-        with pytest.raises(SystemExit) as stopped:
-            parse_args(["--env", env_id, "--help"])
-        text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-        assert stopped.value.code == 0 and "discount factor, in [0, 1]" in text
-        for name in ("gamma", "buffer_size", "td_lambda", "train_frequency"):
-            value = getattr(args_for(avf_qplex, env_id), name)
-            assert f"--{name.replace('_', '-')}" in text and f"(default: {value})" in text, (env_id, name)
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_missing_gpu_is_told_in_one_line(tmp_path, monkeypatch, script):
+    arguments = ["--device=cuda", f"--runs-dir={tmp_path}"]
+    code, message = run_as_program(monkeypatch, *arguments, script=script)
+    assert (code, message) == (1, "--device cuda: there is none") and not any(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written(tmp_path):
-    """In a process of its own: exit code 1, one line, no traceback."""
-    (tmp_path / "file").write_text("kept")
-    process = start("avf_qplex", f"--runs-dir={tmp_path / 'file'}")
-    printed, errors = process.communicate(timeout=60)
-    assert process.returncode == 1 and not printed and one_line(errors) and str(tmp_path / "file") in errors
-    assert (tmp_path / "file").read_text() == "kept"
+def test_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_text("kept")
+    code, message = run_as_program(monkeypatch, f"--runs-dir={path}")
+    assert code == 1 and one_line(message) and str(path) in message and path.read_text() == "kept"
 
 
 def test_other_runs_and_damaged_checkpoints_are_refused(tmp_path, monkeypatch):
-    folder = train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), **TINY), stop_in(monkeypatch, avf_qplex, 3))
+    """In one line each, and nothing is changed."""
+    folder = interrupted(monkeypatch, avf_qplex, short(avf_qplex, "bp-10", tmp_path, total_timesteps=400), steps=3)
     path = folder / "checkpoint.pt"
     whole = path.read_bytes()
     args = load(path)["args"]
-    torch.save({"algorithm": "avf_vdn", "args": args}, path)
-    code, message = run_as_program(monkeypatch, f"--resume={folder}")
-    assert code == 1 and message == f"{path} is of avf_vdn, not of avf_qplex"
-    damaged = [whole[:1000], whole[:-100], b"\x80", b"text\n", whole[: len(whole) // 2] + bytes(2000), bytes(99)]
-    torch.save({"step": 3}, path)  # of something else
-    damaged.append(path.read_bytes())
-    for content in damaged:
+
+    def refused(content, message):
         path.write_bytes(content)
-        code, message = run_as_program(monkeypatch, f"--resume={folder}")
-        assert code == 1 and one_line(message) and message.startswith(f"cannot read {path}: "), content[:20]
+        code, said = run_as_program(monkeypatch, f"--resume={folder}")
+        assert code == 1 and one_line(said) and said.startswith(message), said
         assert path.read_bytes() == content and not (folder / "last.pt").exists()
+
+    def written(content):
+        torch.save(content, path)
+        return path.read_bytes()
+
+    refused(written({"algorithm": "avf_vdn", "args": args}), f"{path} is of avf_vdn, not of avf_qplex")
+    of_another_version = {"algorithm": "avf_qplex", "args": args | {"window": 25}}
+    refused(written(of_another_version), f"cannot read {path}: Args.__init__() got an unexpected keyword")
+    of_something_else = written({"step": 3})
+    middle = len(whole) // 2
+    damaged = [whole[:1000], whole[:-100], whole[:middle] + bytes(2000), b"\x80", b"text\n", bytes(99), b""]
+    for content in (of_something_else, *damaged):
+        refused(content, f"cannot read {path}: ")
     path.unlink()
-    code, message = run_as_program(monkeypatch, f"--resume={folder}")
-    assert code == 1 and one_line(message) and message.startswith(f"cannot read {path}: ")
+    code, said = run_as_program(monkeypatch, f"--resume={folder}")
+    assert code == 1 and one_line(said) and said.startswith(f"cannot read {path}: ")
     path.write_bytes(whole)
     assert run_as_program(monkeypatch, f"--resume={folder}")[0] == 0
-
-
-def test_an_empty_checkpoint_is_refused(tmp_path):
-    """What a power cut may leave behind."""
-    (tmp_path / "checkpoint.pt").touch()
-    with pytest.raises(SystemExit, match="cannot read"):
-        parse_args([f"--resume={tmp_path}"])
 
 
 class Malicious:
@@ -423,7 +514,7 @@ class Malicious:
 def test_loading_runs_no_code(tmp_path):
     folder, victim = tmp_path / "run", tmp_path / "victim"
     folder.mkdir()
-    content = {"algorithm": "avf_qplex", "args": {}, "parts": Malicious(victim)}
+    content = {"algorithm": "avf_qplex", "args": {}, "buffer": Malicious(victim)}
     torch.save(content, folder / "checkpoint.pt")
     with pytest.raises(SystemExit) as stopped:
         parse_args([f"--resume={folder}"])
@@ -433,7 +524,7 @@ def test_loading_runs_no_code(tmp_path):
 
 
 def test_files_are_whole_or_not_there(tmp_path, monkeypatch):
-    """A failure while writing leaves the old model or checkpoint whole, and no half of an args.json."""
+    """A failure while writing leaves the old model or checkpoint whole."""
     path, args = tmp_path / "checkpoint.pt", Args()
     save(path, args, step=1)
 
@@ -441,37 +532,27 @@ def test_files_are_whole_or_not_there(tmp_path, monkeypatch):
         Path(file).write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(torch, "save", broken)
-    with pytest.raises(OSError, match="disk full"):
-        save(path, args, step=2)
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "save", broken)
+        with pytest.raises(OSError, match="disk full"):
+            save(path, args, step=2)
     assert load(path)["step"] == 1 and Args(**load(path)["args"]) == args
     save(path, args, step=3)
-    assert load(path)["step"] == 3 and [p.name for p in tmp_path.iterdir()] == ["checkpoint.pt"]
-
-    write = Path.write_text
-
-    def full(self, text):
-        write(self, text[: len(text) // 2])
-        raise OSError("disk full")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match="disk full"):
-        train(args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path / "runs"), **TINY))
-    assert not any(tmp_path.glob("runs/*/args.json"))
+    assert load(path)["step"] == 3 and os.listdir(tmp_path) == ["checkpoint.pt"]
 
 
 def test_track_copies_the_curves(tmp_path, monkeypatch):
     """With a stand-in for wandb, which is optional: what it is told, and the one line where it is missing."""
-    calls, module = [], types.ModuleType("wandb")
+    calls = []
+    module = types.ModuleType("wandb")
     module.init = lambda **options: calls.append(options)
     monkeypatch.setitem(sys.modules, "wandb", module)
-    args = args_for(avf_qplex, "bp-10", runs_dir=str(tmp_path), track=True, **TINY)
-    folder = train(args, stop_in(monkeypatch, avf_qplex, 10))
-    train(parse_args([f"--resume={folder}"]))
+    args = short(avf_qplex, "bp-10", tmp_path, track=True, total_timesteps=400)
+    folder = interrupted(monkeypatch, avf_qplex, args, steps=10)
+    resume(avf_qplex, folder)
     told, again = calls
     assert told["sync_tensorboard"] and told["config"]["track"] and told["config"]["env"] == "bp-10"
     assert told["id"] == told["name"] == again["id"] == folder.name and told["resume"] == again["resume"] == "allow"
     monkeypatch.setitem(sys.modules, "wandb", None)  # as if it were not installed
-    code, message = run_as_program(monkeypatch, "--track", f"--runs-dir={tmp_path}")
-    assert code == 1 and one_line(message) and "wandb" in message and len(list(tmp_path.iterdir())) == 1
+    code, message = run_as_program(monkeypatch, "--track", f"--runs-dir={tmp_path / 'other'}")
+    assert code == 1 and one_line(message) and "wandb" in message

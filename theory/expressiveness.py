@@ -1,9 +1,9 @@
 """Which value tables the mixers represent, and how often QPLEX without conditioning breaks Mac-IGM.
 
-One joint macro-history h and one mixer state are fixed, so that a mixer is a family of tables Q(h, . | m^-), one for
-each situation: who has terminated, and what the others are doing. Names, besides those of `igm.py`:
+One joint macro-history h and one mixer state are fixed, so that a mixer is a family of tables Q(h, .), one for each
+situation. A situation says what is available to each agent. Names, besides those of `igm.py`:
 
-    rows         every (situation, m): a situation in which someone chooses, and an m that agrees with its m^-
+    rows         every (situation, m): a situation in which an agent is free, and a joint action m that it leaves open
     family       a value for each row
     greedy       what is best by an agent's own utilities
 
@@ -11,7 +11,7 @@ each situation: who has terminated, and what the others are doing. Names, beside
 """
 
 import itertools
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import torch
@@ -19,104 +19,153 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from avf_qmix import QMIXMixer
 from avf_qplex import QPLEXMixer
-from theory.igm import mac_igm_batch, situations
-from theory.variants import SeeOngoing, VDNMixer
+from theory.igm import mac_igm_batch, open_actions, paper_available, situations
+from theory.variants import ToldAvailable, VDNMixer, own_actions
 
 
-def joint_tables(mixer, utilities, terminated, state, values=None):
-    """The mixer's value of every joint action; those that do not agree with an m^- belong to other situations.
+def qplex(own, state_size):
+    return QPLEXMixer(own, state_size)
+
+
+def literal_qplex(own, state_size):
+    return QPLEXMixer(own, state_size, mask_ongoing=False)
+
+
+def qmix(own, state_size):
+    return QMIXMixer(len(own), state_size)
+
+
+def vdn(own, state_size):
+    return VDNMixer()
+
+
+# Each makes a mixer from the agents' own macro-actions, bool [n, A], and the size of the state.
+MIXERS = {
+    "VDN": vdn,
+    "QMIX": qmix,
+    "literal": literal_qplex,
+    "as shipped": qplex,  # conditioned on what is available
+    "told available": ToldAvailable,  # conditioned, and its weights see what is available
+}
+
+
+def padded(arrays, filler):
+    """n arrays [batch, |M^i|] as one tensor [batch, n, A]."""
+    widest = max(array.shape[-1] for array in arrays)
+    columns = []
+    for array in arrays:
+        missing = widest - array.shape[-1]
+        columns.append(np.pad(array, ((0, 0), (0, missing)), constant_values=filler))
+    return torch.from_numpy(np.stack(columns, 1))
+
+
+def joint_tables(mixer, utilities, available, state, values=None):
+    """The mixer's value of every joint action. Values of those that are not available mean nothing.
 
     Args:
-        mixer: a mixer of the scripts, in float64.
-        utilities: n float64 arrays [batch, |M^i|]. terminated: bool [batch, n] or [n]. state: float64 [batch, S].
-        values: V_i, float64 [batch, n]; None: max Q_i (Eq. 4).
+        mixer: called as the mixers of the scripts are, in float64.
+        utilities: n float64 arrays [batch, |M^i|].
+        available: n bool arrays [batch, |M^i|] or [|M^i|].
+        state: float64 [batch, S].
+        values: V_i, float64 [batch, n] or [n], for a `Dueling` mixer.
 
     Returns:
         float64 [batch, |M^1|, ..., |M^n|].
     """
     sizes = [u.shape[1] for u in utilities]
-    actions = torch.from_numpy(np.indices(sizes).reshape(len(sizes), -1).T.copy())  # [joint, n]
-    own = np.stack([u[:, m] for u, m in zip(utilities, actions.T.numpy(), strict=True)], -1)  # [batch, joint, n]
-    values = np.stack([u.max(axis=1) for u in utilities], -1) if values is None else values
-    values, terminated = (np.broadcast_to(np.asarray(x)[..., None, :], own.shape) for x in (values, terminated))
-    state = np.broadcast_to(state[:, None], (*own.shape[:2], state.shape[-1]))
-    own, values, terminated, state = (torch.from_numpy(x.copy()) for x in (own, values, terminated, state))
+    batch = len(state)
+    available = [np.broadcast_to(can, u.shape) for can, u in zip(available, utilities, strict=True)]
+    utilities = padded(utilities, np.nan)  # no mixer may read the padding
+    if values is not None:
+        values = torch.from_numpy(np.broadcast_to(values, (batch, len(sizes))).copy())
+        utilities = torch.cat([utilities, values[..., None]], -1)
+    actions = torch.tensor(list(np.ndindex(*sizes)))  # [joint, n]
+
+    def for_each_action(x):
+        return x[:, None].expand(-1, len(actions), *x.shape[1:])
+
     with torch.no_grad():
-        q = mixer(own, values, actions.expand(own.shape), terminated, state)
-    return q.reshape(-1, *sizes).numpy()
+        q = mixer(
+            for_each_action(utilities),
+            actions.expand(batch, -1, -1),
+            for_each_action(padded(available, False)),
+            for_each_action(torch.from_numpy(state)),
+        )
+    return q.reshape(batch, *sizes).numpy()
 
 
-MIXERS = {  # (sizes, width of the state) -> mixer
-    "VDN": lambda sizes, width: VDNMixer(),
-    "QMIX": lambda sizes, width: QMIXMixer(len(sizes), width),
-    "literal": partial(QPLEXMixer, mask_ongoing=False),
-    "as shipped": QPLEXMixer,  # conditioned on ongoing agents
-    "told m^-": SeeOngoing,  # conditioned, and its weights see what they are doing
-}
-
-
-# How often the literal mixer breaks Mac-IGM.
-
-
+# ---- how often the literal mixer breaks Mac-IGM ---------------------------------------------------------------------
 def duplex_tables(utilities, lambdas):
     """sum_i lambda_i(m) A_i(m_i), literal QPLEX up to a constant, with lambdas given instead of computed.
 
     Args:
-        utilities: n arrays [batch, |M^i|]. lambdas: [batch, n, |M^1|, ..., |M^n|].
+        utilities: n arrays [batch, |M^i|].
+        lambdas: [batch, n, |M^1|, ..., |M^n|].
 
     Returns:
         Array [batch, |M^1|, ..., |M^n|].
     """
     q = np.zeros_like(lambdas[:, 0])
     for i, u in enumerate(utilities):
-        own_axis = [len(u)] + [u.shape[1] if j == i else 1 for j in range(len(utilities))]
-        q = q + lambdas[:, i] * (u - u.max(axis=1, keepdims=True)).reshape(own_axis)
+        advantage = u - u.max(axis=1, keepdims=True)
+        own_axis = [len(u)] + [1] * len(utilities)
+        own_axis[i + 1] = u.shape[1]
+        q = q + lambdas[:, i] * advantage.reshape(own_axis)
     return q
 
 
-def breaks(sizes, ongoing_agents, count, seed, mixer=None, per_network=100):
+def breaks(sizes, busy_agents, count, seed, make=None, per_network=100):
     """How many random situations violate Mac-IGM ("every"): utilities N(0, 1), m^- uniform.
 
     Args:
-        sizes: |M^i|, n ints. ongoing_agents: the first so many are ongoing. count: of situations.
-        mixer: as in MIXERS; networks as initialised, `per_network` situations for each, states N(0, 1) of width 4.
-            None: the literal formula, with independent lambda_i(m), |N(0, 1)|.
+        sizes: |M^i|, n ints.
+        busy_agents: the first so many are busy.
+        count: of situations.
+        make: as in MIXERS. Networks are as initialised, with `per_network` situations for each, and states are N(0, 1)
+            of width 4. None: the literal formula, with independent lambda_i(m), |N(0, 1)|.
 
     Returns:
         int.
     """
-    rng, n = np.random.default_rng(seed), len(sizes)
+    rng = np.random.default_rng(seed)
+    n = len(sizes)
     utilities = [rng.normal(size=(count, size)) for size in sizes]
-    terminated = np.arange(n) >= ongoing_agents
-    ongoing = rng.integers(sizes, size=(count, n))
-    if mixer is None:
-        q = duplex_tables(utilities, np.abs(rng.normal(size=(count, n, *sizes))))
+    free = np.arange(n) >= busy_agents
+    running = rng.integers(sizes, size=(count, n))
+    available = paper_available(sizes, free, running)
+    if make is None:
+        lambdas = np.abs(rng.normal(size=(count, n, *sizes)))
+        q = duplex_tables(utilities, lambdas)
     else:
-        state, parts = rng.normal(size=(count, 4)), []
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            for start in range(0, count, per_network):
-                part = slice(start, start + per_network)
-                network = mixer(sizes, 4).double()
-                parts.append(joint_tables(network, [u[part] for u in utilities], terminated, state[part]))
-        q = np.concatenate(parts)
-    _, loss = mac_igm_batch(q, utilities, terminated, ongoing)
+        state = rng.normal(size=(count, 4))
+        q = fresh_network_tables(make, utilities, available, state, seed, per_network)
+    _, loss = mac_igm_batch(q, utilities, available)
     return int((loss > 1e-9 * np.abs(q).max()).sum())
 
 
-# Families of tables, and the classes of mixers as cones.
+def fresh_network_tables(make, utilities, available, state, seed, per_network):
+    """`joint_tables` with a new network, as initialised, for every `per_network` of the batch."""
+    own = own_actions([u.shape[1] for u in utilities])
+    tables = []
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        for start in range(0, len(state), per_network):
+            part = slice(start, start + per_network)
+            network = make(own, state.shape[1]).double()
+            own_part = [u[part] for u in utilities], [can[part] for can in available]
+            tables.append(joint_tables(network, *own_part, state[part]))
+    return np.concatenate(tables)
 
 
+# ---- families of tables ---------------------------------------------------------------------------------------------
 def rows(sizes):
-    """Every (terminated, ongoing, m): each situation with a chooser, all terminated first, each m it leaves open."""
-    return [
-        (terminated, ongoing, m)
-        for terminated, ongoing in situations(sizes)
-        if any(terminated)
-        for m in itertools.product(
-            *(range(size) if done else [on] for size, done, on in zip(sizes, terminated, ongoing, strict=True))
-        )
-    ]
+    """Every (available, m) of the paper's situations with a free agent; first come those in which all are free."""
+    result = []
+    for available in situations(sizes):
+        somebody_is_free = any(sum(can) > 1 for can in available)
+        if somebody_is_free:
+            result.extend((available, m) for m in open_actions(available))
+    return result
 
 
 FAMILIES = ("additive", "one table", "a table each")
@@ -131,126 +180,194 @@ def random_family(kind, sizes, rng):
     index = rows(sizes)
     if kind == "a table each":
         family = rng.normal(size=len(index))
-        for situation in dict.fromkeys(row[:2] for row in index):
-            here = [k for k, row in enumerate(index) if row[:2] == situation]  # the greedy choice comes first
-            family[here] = np.roll(family[here], -family[here].argmax())
+        for situation in dict.fromkeys(available for available, _ in index):
+            here = [k for k, (available, _) in enumerate(index) if available == situation]
+            values = family[here]
+            family[here] = np.roll(values, -values.argmax())  # the greedy choices come first
         return family
     while True:
-        q = rng.normal(size=sizes)
         if kind == "additive":
-            q = sum(np.ix_(*(np.sort(rng.normal(size=size))[::-1] for size in sizes)))
-        if all((q.take([0], axis=i) == q.max(axis=i, keepdims=True)).all() for i in range(len(sizes))):
-            return np.array([q[m] for _, _, m in index])
+            utilities = [np.sort(rng.normal(size=size))[::-1] for size in sizes]
+            q = sum(np.ix_(*utilities))
+        else:
+            q = rng.normal(size=sizes)
+        if is_consistent(q):
+            return np.array([q[m] for _, m in index])
 
 
-CLASSES = ("VDN", "QMIX", "monotone", "literal", "as shipped", "told m^-")
+def is_consistent(q):
+    """Whether macro-action 0 is best for each agent whatever the others do: Mac-IGM for every M^+ and m^-."""
+    for axis in range(q.ndim):
+        best = q.max(axis=axis, keepdims=True)
+        if (q.take([0], axis=axis) < best).any():
+            return False
+    return True
+
+
+# ---- the classes of mixers as cones ---------------------------------------------------------------------------------
+CLASSES = ("VDN", "QMIX", "monotone", "literal", "as shipped", "told available")
 
 
 def cone(name, sizes, ranks):
     """The families that a mixer represents, utilities free: {columns @ x}. The entries are 1, -1 and 0.
 
-    "VDN": sums of utilities. "monotone": whatever rises with every utility (Eq. 1), a sum of indicators of upper sets.
-    "QMIX": rises, and has rising differences (one layer of ELU is convex); a bound, for 2 agents. The others are QPLEX
-    with w_i > 0, b_i and lambda_i >= 0 free: b + sum_i w_i V_i gives a 1; each disadvantage of a macro-action that is
-    not greedy a -1, in V_i if the agent is ongoing and conditioned, else in lambda_i A_i. "literal": not conditioned,
-    its weights see neither who is ongoing nor m^-. "as shipped": conditioned, same weights. "told m^-": they see both.
-
     Args:
+        name: one of CLASSES, see `coefficients`.
         ranks: for each agent the order of its utilities, a permutation of 0 .. |M^i| - 1; the highest is greedy.
 
     Returns:
-        columns: float64 [rows, parameters]. free: bool [parameters], False where x must not be negative.
+        columns: float64 [rows, parameters].
+        free: bool [parameters], False where x must not be negative.
     """
+    by_row = [coefficients(name, sizes, ranks, *row) for row in rows(sizes)]
+    place = {}  # of each parameter
+    for entry in by_row:
+        for parameter in entry:
+            place.setdefault(parameter, len(place))
+    columns = np.zeros((len(by_row), len(place)))
+    for k, entry in enumerate(by_row):
+        for parameter, coefficient in entry.items():
+            columns[k, place[parameter]] = coefficient
+    free = [parameter[0] == "value" for parameter in place]
+    return columns, np.array(free)
 
-    def entry(terminated, ongoing, m):
-        """The coefficients of a row, by parameter."""
-        rank = tuple(order[m_i] for order, m_i in zip(ranks, m, strict=True))
-        worse = [i for i, size in enumerate(sizes) if rank[i] < size - 1]
-        worse_choice, situation = [i for i in worse if terminated[i]], (terminated, ongoing)
-        if name == "VDN":
-            return {("value", i, m_i): 1 for i, m_i in enumerate(m)}
-        if name == "QMIX":
-            steps = [range(1, r + 1) for r in rank]
-            alone = {("gain", i, k): 1 for i, ks in enumerate(steps) for k in ks}
-            return {("value",): 1} | alone | {("joint gain", *ks): 1 for ks in itertools.product(*steps)}
-        if name == "monotone":
-            return {("value",): 1} | {("gain", upper): 1 for upper in _upper_sets(sizes) if rank in upper}
-        if name == "literal":
-            return {("value",): 1} | ({("loss", m): -1} if worse else {})
-        if name == "as shipped":
-            return {("value",): 1} | {("loss", i, m if terminated[i] else m[i]): -1 for i in worse}
-        return {("value", situation): 1} | ({("loss", situation, m): -1} if worse_choice else {})
 
-    entries = [entry(*row) for row in rows(sizes)]
-    names = list(dict.fromkeys(key for entry in entries for key in entry))
-    columns = np.array([[entry.get(key, 0.0) for key in names] for entry in entries])
-    return columns, np.array([key[0] == "value" for key in names])
+def coefficients(name, sizes, ranks, available, m):
+    """The coefficients of a row, by parameter. Those that begin with "value" may be negative.
+
+    "VDN": sums of utilities. "monotone": whatever rises with every utility (Eq. 1), a sum of indicators of upper sets.
+    "QMIX": rises, and has rising differences (one layer of ELU is convex); a bound, for 2 agents. The others are QPLEX
+    with w_i > 0, b_i and lambda_i >= 0 free: b + sum_i w_i V_i gives a 1. Each disadvantage of a macro-action that is
+    not greedy gives a -1, in V_i if the agent is busy and conditioned, else in lambda_i A_i. "literal": not
+    conditioned, its weights do not see what is available. "as shipped": conditioned, same weights. "told available":
+    its weights see it, too.
+    """
+    rank = tuple(order[m_i] for order, m_i in zip(ranks, m, strict=True))
+    worse = [i for i, size in enumerate(sizes) if rank[i] < size - 1]
+    is_free = [sum(can) > 1 for can in available]
+    if name == "VDN":
+        return {("value", i, m_i): 1 for i, m_i in enumerate(m)}
+    if name == "QMIX":
+        entry = {("value",): 1}
+        steps = [range(1, r + 1) for r in rank]
+        for i, own_steps in enumerate(steps):
+            for k in own_steps:
+                entry["gain", i, k] = 1
+        for ks in itertools.product(*steps):
+            entry["joint gain", *ks] = 1
+        return entry
+    if name == "monotone":
+        entry = {("value",): 1}
+        for upper in upper_sets(sizes):
+            if rank in upper:
+                entry["gain", upper] = 1
+        return entry
+    if name == "literal":
+        entry = {("value",): 1}
+        if worse:
+            entry["loss", m] = -1
+        return entry
+    if name == "as shipped":
+        entry = {("value",): 1}
+        for i in worse:
+            cause = m if is_free[i] else m[i]
+            entry["loss", i, cause] = -1
+        return entry
+    entry = {("value", available): 1}
+    if any(is_free[i] for i in worse):
+        entry["loss", available, m] = -1
+    return entry
 
 
 @cache
-def _upper_sets(sizes):
+def upper_sets(sizes):
+    """Every set of joint ranks that holds with a joint rank all those that are nowhere lower; frozensets."""
     grid = list(np.ndindex(*sizes))
-    above = {a: {b for b in grid if all(x >= y for x, y in zip(b, a, strict=True))} for a in grid}
-    subsets = (frozenset(itertools.compress(grid, bits)) for bits in itertools.product((0, 1), repeat=len(grid)))
-    return [subset for subset in subsets if all(above[a] <= subset for a in subset)]
+    above = {}
+    for low in grid:
+        above[low] = {high for high in grid if all(h >= x for h, x in zip(high, low, strict=True))}
+    result = []
+    for bits in itertools.product((0, 1), repeat=len(grid)):
+        subset = frozenset(itertools.compress(grid, bits))
+        if all(above[rank] <= subset for rank in subset):
+            result.append(subset)
+    return result
 
 
 def residuals(name, sizes, families, steps=2_000):
     """The least root mean squared error of a mixer's class (`cone`), over all orders of the utilities.
 
     Args:
-        families: float64 [batch, rows]. steps: of an accelerated projected gradient.
+        families: float64 [batch, rows].
+        steps: of an accelerated projected gradient.
 
     Returns:
         float64 [batch], exact to about 1e-9.
     """
-    best, seen = np.full(len(families), np.inf), set()
-    for ranks in itertools.product(*(itertools.permutations(range(size)) for size in sizes)):
+    best = np.full(len(families), np.inf)
+    seen = set()
+    orders = [itertools.permutations(range(size)) for size in sizes]
+    for ranks in itertools.product(*orders):
         columns, free = cone(name, sizes, ranks)
-        if (key := columns.tobytes()) in seen:
+        key = columns.tobytes()
+        if key in seen:
             continue
         seen.add(key)
-        rate = np.linalg.norm(columns, 2) ** -2
-        x = ahead = np.zeros((columns.shape[1], len(families)))
-        for k in range(steps):
-            moved = ahead - rate * columns.T @ (columns @ ahead - families.T)
-            moved = np.where(free[:, None], moved, np.maximum(moved, 0))
-            ahead, x = moved + k / (k + 3) * (moved - x), moved
-        best = np.minimum(best, np.sqrt(np.square(columns @ x - families.T).mean(axis=0)))
+        error = columns @ nearest(columns, free, families, steps) - families.T
+        rms = np.sqrt(np.square(error).mean(axis=0))
+        best = np.minimum(best, rms)
     return best
 
 
-def fit(mixer, sizes, families, steps=2_000, learning_rate=0.005, seed=0):
-    """Trains the utilities and a mixer for each family, by the mixer's own gradient; the state is a constant.
+def nearest(columns, free, families, steps):
+    """The x, float64 [parameters, batch], for which columns @ x is nearest to the families, x >= 0 where not free."""
+    rate = np.linalg.norm(columns, 2) ** -2
+    x = np.zeros((columns.shape[1], len(families)))
+    ahead = x
+    for k in range(steps):
+        moved = ahead - rate * columns.T @ (columns @ ahead - families.T)
+        moved = np.where(free[:, None], moved, np.maximum(moved, 0))
+        ahead = moved + k / (k + 3) * (moved - x)
+        x = moved
+    return x
+
+
+def fit(make, sizes, families, steps=2_000, learning_rate=0.005, seed=0):
+    """Trains the utilities and a mixer for each family, by the mixer's own gradient. The state is a constant.
 
     Args:
-        mixer: as in MIXERS. families: float64 [batch, rows], macro-action 0 greedy. The rest: of Adam and its start.
+        make: as in MIXERS.
+        families: float64 [batch, rows], macro-action 0 greedy.
+        steps, learning_rate, seed: of Adam and its start.
 
     Returns:
         float64 [batch], the root mean squared error at the end.
     """
-    index, agents = rows(sizes), torch.arange(len(sizes))
-    chosen, actions = (torch.tensor([row[k] for row in index]) for k in (0, 2))  # [rows, n] each
-    state, families = torch.ones(len(index), 1, dtype=torch.float64), torch.from_numpy(families)
+    index = rows(sizes)
+    own = own_actions(sizes)
+    actions = torch.tensor([m for _, m in index])  # [rows, n]
+    masks = [np.array([available[i] for available, _ in index]) for i in range(len(sizes))]
+    available = padded(masks, False)  # [rows, n, A]
+    state = torch.ones(len(index), 1, dtype=torch.float64)
+    families = torch.from_numpy(families)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        networks = [mixer(sizes, 1).double() for _ in families]
-        utilities = torch.rand(len(families), len(sizes), max(sizes), dtype=torch.float64)
+        networks = [make(own, 1).double() for _ in families]
+        utilities = torch.rand(len(families), *own.shape, dtype=torch.float64)
     utilities[:, :, 0] += 1.0  # start from the greedy choices of the family
-    for i, size in enumerate(sizes):
-        utilities[:, i, size:] = -1e9
+    utilities.requires_grad_()
     parameters, buffers = stack_module_state(networks)
 
     def forward(parameters, buffers, utilities):
-        own = utilities[agents, actions]  # [rows, n]
-        return functional_call(
-            networks[0], (parameters, buffers), (own, utilities.amax(-1).expand(own.shape), actions, chosen, state)
-        )
+        at_each_row = utilities.expand(len(index), -1, -1)
+        inputs = (at_each_row, actions, available, state)
+        return functional_call(networks[0], (parameters, buffers), inputs)
 
-    optimizer = torch.optim.Adam([utilities.requires_grad_(), *parameters.values()], learning_rate)
+    optimizer = torch.optim.Adam([utilities, *parameters.values()], learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
-        error = (vmap(forward)(parameters, buffers, utilities) - families).square().mean(1)
+        q = vmap(forward)(parameters, buffers, utilities)  # [batch, rows]
+        error = (q - families).square().mean(1)
         optimizer.zero_grad()
         error.sum().backward()
         optimizer.step()
@@ -258,89 +375,110 @@ def fit(mixer, sizes, families, steps=2_000, learning_rate=0.005, seed=0):
     return error.detach().sqrt().numpy()
 
 
-# The construction of the proof.
-
-
+# ---- the construction of the proof ----------------------------------------------------------------------------------
 def represent(utilities, tables):
-    """A SeeOngoing mixer that has the given table in every situation (README: the proof), for a state of width 1.
+    """A ToldAvailable mixer that has the given table in every situation (README: the proof), for a state of width 1.
 
-    A hidden unit for each situation, and one for each joint action in each. The first agent that deviates is charged
-    the whole loss. One head is enough, as every weight sees the situation.
+    A hidden unit stands for each situation, and one for each joint action that is open in it. The first agent that
+    deviates is charged the whole loss. One head is enough, as every weight sees the situation.
 
     Args:
-        utilities: n arrays [|M^i|]. tables: {(terminated, ongoing): array [|M^1|, ..., |M^n|]}, satisfying Mac-IGM
-            (ties="every"); entries that do not agree with m^- are ignored.
+        utilities: n arrays [|M^i|].
+        tables: {available: array [|M^1|, ..., |M^n|]} for some situations, or for some combinations of initiation sets.
+            Each satisfies Mac-IGM (ties="every"). Entries that are not available are ignored.
 
     Returns:
-        SeeOngoing, float64.
+        ToldAvailable, float64.
     """
-    sizes = [len(u) for u in utilities]
-    n, widest, index = len(sizes), max(sizes), [row for row in rows(sizes) if row[:2] in tables]
-    mixer = SeeOngoing(sizes, 1, max(len(tables), len(index)), heads=1).double().requires_grad_(False)
+    own = own_actions([len(u) for u in utilities])
+    n = len(utilities)
+    index = []
+    for available in tables:
+        index.extend((available, m) for m in open_actions(available))
+    mixer = ToldAvailable(own, 1, hidden=len(index), heads=1).double().requires_grad_(False)
     for parameter in mixer.parameters():
         parameter.zero_()
-    (state_in, _, state_out), (action_in, _, action_out) = mixer.of_state, mixer.of_action
-
-    def fire(layer, unit, terminated, ongoing, m=None):
-        """A hidden unit that is 1 where m^-, and m if given, are these, and 0 elsewhere."""
-        weights = layer.weight[unit, 1:].view(-1, n, widest)  # of m^-, and of m
-        for i in range(n):
-            if terminated[i]:
-                weights[0, i] = -1.0
-            else:
-                weights[0, i, ongoing[i]] = 1.0
-        layer.bias[unit] = 1.0 - (n - sum(terminated))
-        if m is not None:
-            weights[1, range(n), m] = 1.0
-            layer.bias[unit] -= n
-
-    def greedy(terminated, ongoing):
-        return tuple(int(u.argmax()) if t else on for u, t, on in zip(utilities, terminated, ongoing, strict=True))
+    state_in, _, state_out = mixer.state_net
+    action_in, _, action_out = mixer.action_net
 
     lambdas = np.zeros((n, len(index)))
-    for k, (*situation, m) in enumerate(index):
-        fire(action_in, k, *situation, m)
-        table, top = tables[tuple(situation)], greedy(*situation)
-        losses = [u[best] - u[own] for u, best, own in zip(utilities, top, m, strict=True)]
-        if any(losses):
-            i = int(np.flatnonzero(losses)[0])
-            lambdas[i, k] = (table[top] - table[m]) / losses[i]
-    scale = 2.0 * lambdas.max(initial=0.0) or 1.0
+    for unit, (available, m) in enumerate(index):
+        fire(action_in, unit, own, available, m)
+        best = greedy_choice(utilities, available)
+        loss = tables[available][best] - tables[available][m]
+        own_losses = [u[b] - u[a] for u, b, a in zip(utilities, best, m, strict=True)]
+        deviators = np.flatnonzero(own_losses)
+        if len(deviators):
+            first = deviators[0]
+            lambdas[first, unit] = loss / own_losses[first]
+    scale = 2.0 * lambdas.max() or 1.0
     share = np.maximum(lambdas / scale, 1e-20)  # at most 1/2
-    action_out.weight[:, : len(index)] = torch.from_numpy(np.log(share / (1 - share)))
+    logits = np.log(share / (1 - share))
+    action_out.weight.copy_(torch.from_numpy(logits))
 
-    for unit, (situation, table) in enumerate(tables.items()):
-        fire(state_in, unit, *situation)
-        top = greedy(*situation)
-        state_out.weight[n : 2 * n, unit] = (table[top] - sum(u[m] for u, m in zip(utilities, top, strict=True))) / n
-    state_out.bias[:n], state_out.bias[2 * n], state_out.bias[2 * n + 1 :] = 1.0, scale, 40.0  # sigmoid(40) = 1
+    for unit, (available, table) in enumerate(tables.items()):
+        fire(state_in, unit, own, available)
+        best = greedy_choice(utilities, available)
+        missing = table[best] - sum(u[b] for u, b in zip(utilities, best, strict=True))
+        state_out.weight[n : 2 * n, unit] = missing / n  # b_i
+    state_out.bias[:n] = 1.0  # w_i
+    state_out.bias[2 * n] = scale  # the key
+    state_out.bias[2 * n + 1 :] = 40.0  # agent_i, and sigmoid(40) = 1
     return mixer
 
 
-# The README's tables.
+def greedy_choice(utilities, available):
+    """A tuple of local greedy choices, n ints."""
+    best = [np.where(can, u, -np.inf).argmax() for u, can in zip(utilities, available, strict=True)]
+    return tuple(map(int, best))
 
 
+def fire(layer, unit, own, available, m=None):
+    """Makes a hidden unit 1 where just this is available (and m, if given, is the joint action), and 0 elsewhere.
+
+    Its inputs are a state of width 1, what is available and, if m is given, the joint action, one-hot.
+    """
+    seen = torch.zeros(own.shape)
+    for i, can in enumerate(available):
+        seen[i, : len(can)] = torch.tensor(can)
+    weights = [torch.zeros(1), (2 * seen - 1).flatten()]  # 1 for what is available, -1 for what is not
+    matches = seen.sum()
+    if m is not None:
+        one_hot = torch.nn.functional.one_hot(torch.tensor(m), own.shape[1])
+        weights.append(one_hot.flatten())
+        matches += len(m)
+    layer.weight[unit] = torch.cat(weights)
+    layer.bias[unit] = 1 - matches
+
+
+# ---- the tables of README.md ----------------------------------------------------------------------------------------
 def main():
     torch.set_num_threads(1)
     print("Mac-IGM violations in 2,000 random situations: lambda free / literal at initialisation / as shipped")
-    cases = [(agents, size, going) for agents in (2, 3, 4) for size in (2, 3, 5) for going in range(1, agents)]
-    for agents, size, going in cases:
-        makes = (None, MIXERS["literal"], MIXERS["as shipped"])
-        counts = [breaks([size] * agents, going, 2_000, 0, make) for make in makes]
-        print(f"{agents} agents, {size} macro-actions, {going} ongoing: {' / '.join(map(str, counts))}", flush=True)
-    print(
-        "\nError of the best fit, families of variance 1, 2 agents x 3 macro-actions: class / mixer as trained (worst)"
-    )
-    sizes, rng = (3, 3), np.random.default_rng(0)
+    for agents, size in itertools.product((2, 3, 4), (2, 3, 5)):
+        for busy in range(1, agents):
+            makes = (None, MIXERS["literal"], MIXERS["as shipped"])
+            counts = [breaks([size] * agents, busy, 2_000, 0, make) for make in makes]
+            text = " / ".join(map(str, counts))
+            print(f"{agents} agents, {size} macro-actions, {busy} busy: {text}", flush=True)
+    print("\nError of the best fit, families of variance 1, 2 agents x 3 macro-actions: class / as trained (worst)")
+    sizes = (3, 3)
+    rng = np.random.default_rng(0)
     for kind in FAMILIES:
-        families = np.array([random_family(kind, sizes, rng) for _ in range(8)])
-        families = (families - families.mean(1, keepdims=True)) / families.std(1, keepdims=True)
+        families = standardised([random_family(kind, sizes, rng) for _ in range(8)])
         for name in CLASSES:
             text = f"{np.median(residuals(name, sizes, families)):.3f}"
             if name in MIXERS:
                 trained = fit(MIXERS[name], sizes, families)
                 text += f" / {np.median(trained):.3f} ({trained.max():.3f})"
             print(f"{kind}, {name}: {text}", flush=True)
+
+
+def standardised(families):
+    """Families as an array [batch, rows], each of mean 0 and variance 1."""
+    families = np.array(families)
+    families = families - families.mean(1, keepdims=True)
+    return families / families.std(1, keepdims=True)
 
 
 if __name__ == "__main__":

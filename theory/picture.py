@@ -19,19 +19,34 @@ from theory.igm import conditional_argmax, local_choices, mac_igm
 from theory.variants import two_by_two
 
 UTILITIES = np.array([1.0, 0.0]), np.array([1.0, 0.0])  # of a and b
-TERMINATED, ONGOING = (True, False), (0, 1)  # agent 2 goes on with b
-GREEDY, BEST, SHUT = "#d55e00", "#0072b2", "0.75"
+BUSY_WITH = 1  # agent 2 goes on with b
+AVAILABLE = (True, True), (False, True)
+GREEDY = "#d55e00"
+BEST = "#0072b2"
+SHUT = "0.75"
 RADII = {GREEDY: 0.40, BEST: 0.34}  # concentric where both are in one place
 
 
-def tables():
-    """What the picture shows: for each panel its title, the mixer's table float64 [2, 2] and the Verdict on it."""
-    found = []
-    for title, options in (("QPLEX to the letter (Eq. 4)", dict(mask_ongoing=False)), ("avf_qplex.py", {})):
-        (q,) = joint_tables(two_by_two(**options), [u[None] for u in UTILITIES], TERMINATED, np.zeros((1, 1)))
-        q = q.round(6)  # 1e-10 is added to the mixer's weights
-        found.append((title, q, mac_igm(q, UTILITIES, TERMINATED, ONGOING)))
-    return found
+def table(mixer):
+    """The mixer's values float64 [2, 2]; a column has those for an agent 2 that goes on with its macro-action."""
+    utilities = [u[None] for u in UTILITIES]
+    state = np.zeros((1, 1))
+    columns = []
+    for running in range(2):
+        available = [np.ones(2, bool), np.arange(2) == running]
+        (q,) = joint_tables(mixer, utilities, available, state)
+        columns.append(q[:, running])
+    return np.stack(columns, 1).round(6) + 0.0  # 1e-10 is added to some weights of the mixer; + 0.0: not -0
+
+
+def panels():
+    """What the picture shows: for each panel its title, the table and the Verdict on it."""
+    literal = table(two_by_two(mask_ongoing=False))
+    shipped = table(two_by_two())
+    return [
+        ("QPLEX to the letter (Eq. 4)", literal, mac_igm(literal, UTILITIES, AVAILABLE)),
+        ("avf_qplex.py", shipped, mac_igm(shipped, UTILITIES, AVAILABLE)),
+    ]
 
 
 def draw(path):
@@ -41,32 +56,41 @@ def draw(path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, panels = plt.subplots(1, 2, figsize=(9, 4.8), layout="constrained")
+    figure, all_axes = plt.subplots(1, 2, figsize=(9, 4.8), layout="constrained")
     figure.get_layout_engine().set(h_pad=0.12)
-    for axes, (title, q, verdict) in zip(panels, tables(), strict=True):
-        axes.add_patch(plt.Rectangle((-0.5, -0.5), 1, 2, color="0.93"))  # what agent 2's choice has shut
-        for m, value in np.ndenumerate(q):
-            closed = m[1] != ONGOING[1]
-            axes.text(m[1], m[0], f"{value:g}", ha="center", va="center", fontsize=24, color=SHUT if closed else "k")
-        marks = (
-            (GREEDY, local_choices(UTILITIES, TERMINATED, ONGOING)),
-            (BEST, conditional_argmax(q, TERMINATED, ONGOING)),
-        )
-        for colour, ((row, column),) in marks:
-            axes.add_patch(plt.Circle((column, row), RADII[colour], fill=False, color=colour, linewidth=3.5))
-        says = "Mac-IGM holds" if verdict else f"Mac-IGM fails: agent 1's choice loses {verdict.margin:g}"
+    for axes, (title, q, verdict) in zip(all_axes, panels(), strict=True):
+        shut = plt.Rectangle((-0.5, -0.5), 1, 2, color="0.93")  # what agent 2's choice has shut
+        axes.add_patch(shut)
+        for (row, column), value in np.ndenumerate(q):
+            colour = "k" if column == BUSY_WITH else SHUT
+            axes.text(column, row, f"{value:g}", ha="center", va="center", fontsize=24, color=colour)
+        marks = {
+            GREEDY: local_choices(UTILITIES, AVAILABLE),
+            BEST: conditional_argmax(q, AVAILABLE),
+        }
+        for colour, ((row, column),) in marks.items():
+            ring = plt.Circle((column, row), RADII[colour], fill=False, color=colour, linewidth=3.5)
+            axes.add_patch(ring)
+        says = "Mac-IGM holds"
+        if not verdict:
+            says = f"Mac-IGM fails: agent 1's choice loses {verdict.margin:g}"
         axes.set_title(f"{title}\n{says}", fontsize=12)
-        names = [f"a, utility {UTILITIES[0][0]:g}", f"b, utility {UTILITIES[0][1]:g}"]
         axes.set_xticks([0, 1], ["a", "b, ongoing"], fontsize=11)
-        axes.set_yticks([0, 1], names, fontsize=11)
-        axes.set(xlim=(-0.5, 1.5), ylim=(1.5, -0.5), aspect="equal", xlabel="agent 2", ylabel="agent 1 chooses")
+        axes.set_yticks([0, 1], ["a, utility 1", "b, utility 0"], fontsize=11)
+        axes.set(xlim=(-0.5, 1.5), ylim=(1.5, -0.5), aspect="equal")
+        axes.set(xlabel="agent 2", ylabel="agent 1 chooses")
         axes.set_xticks([0.5], minor=True)
         axes.set_yticks([0.5], minor=True)
         axes.grid(which="minor", color="0.4")
         axes.tick_params(which="both", length=0)
-    handles = [plt.Line2D([], [], marker="o", linestyle="", mfc="none", mec=colour, mew=3, ms=14, label=label)
-               for colour, label in ((GREEDY, "what the agents' own greedy choices lead to"),
-                                     (BEST, "the best that agent 2's ongoing b leaves open"))]  # fmt: skip
+    legend = {
+        GREEDY: "what the agents' own greedy choices lead to",
+        BEST: "the best that agent 2's ongoing b leaves open",
+    }
+    handles = []
+    for colour, label in legend.items():
+        ring = dict(marker="o", linestyle="", markersize=14, markerfacecolor="none", markeredgewidth=3)
+        handles.append(plt.Line2D([], [], markeredgecolor=colour, label=label, **ring))
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=11)
     figure.savefig(path, dpi=150)
     plt.close(figure)
@@ -76,7 +100,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, help="the picture, PNG; without it the numbers are printed alone")
     options = parser.parse_args(argv)
-    for title, q, verdict in tables():
+    for title, q, verdict in panels():
         print(f"{title}: {q.tolist()}, {verdict}")
     if options.output:
         draw(options.output)

@@ -18,12 +18,13 @@ from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
-CARRIER, KEEPER = 0, 1
+CARRIER = 0
+KEEPER = 1
 STEPS = {"hand": 2, "cart": 3}
 PAY = {"hand": 1, "cart": 2}
 TRIPS = 2
 SHOWS = ("position", "clock", "trips")
-INPUTS = ("joint", "single_chose", "single_ends", "real", "decision", "decision+elapsed")
+INPUTS = ("joint", "single_chose", "single_ends", "real", "real-both", "decision", "decision+elapsed")
 VIEWS = ("actions", "chosen", "histories")
 
 
@@ -91,81 +92,107 @@ class Delivery:
     def __init__(self, shows, random_tidy=True, gamma=1, policy=uniform, optimal=False):
         if shows not in SHOWS:
             raise ValueError(f"shows must be one of {SHOWS}, got {shows!r}")
-        self.shows, self.random_tidy, self.gamma = shows, random_tidy, Fraction(gamma)
-        self.policy, self.optimal = policy, optimal
-        self._intervals, self._values = {}, {}
+        self.shows = shows
+        self.random_tidy = random_tidy
+        self.gamma = Fraction(gamma)
+        self.policy = policy
+        self.optimal = optimal
+        self._intervals = {}  # those that were asked for, by row
+        self._values = {}
 
     def state(self, trips, walked, time):
         """The true state as the environment reports it: a tuple of ints."""
-        return {"position": (trips, walked), "clock": (trips, time), "trips": (trips,)}[self.shows]
+        vectors = {
+            "position": (trips, walked),
+            "clock": (trips, time),
+            "trips": (trips,),
+        }
+        return vectors[self.shows]
 
     def start_rows(self):
         """{Row: probability} of the first decision row."""
-        return self._choose(0, 0, 0, (None, None), (True, True), (0, 0), ((), ()), (None, None))
+        nothing = (None, None)
+        return self._choose(0, 0, 0, nothing, (True, True), (0, 0), ((), ()), nothing)
 
     def _choose(self, trips, walked, time, macros, chosen, elapsed, histories, macro_states):
+        """{Row: probability} of what the agents that choose here can choose."""
         state = self.state(trips, walked, time)
         macro_states = tuple(state if new else old for new, old in zip(chosen, macro_states, strict=True))
-        options = [self.policy(i, histories[i]) if chosen[i] else {macros[i]: Fraction(1)} for i in (CARRIER, KEEPER)]
-        return {
-            Row(trips, walked, time, (m0, m1), chosen, elapsed, histories, state, macro_states): p0 * p1
-            for (m0, p0), (m1, p1) in product(options[0].items(), options[1].items())
-            if p0 * p1
-        }
+        options = []
+        for agent in (CARRIER, KEEPER):
+            goes_on = {macros[agent]: Fraction(1)}
+            options.append(self.policy(agent, histories[agent]) if chosen[agent] else goes_on)
+        rows = {}
+        for (trip, p), (keeping, q) in product(options[CARRIER].items(), options[KEEPER].items()):
+            if p * q:
+                row = Row(trips, walked, time, (trip, keeping), chosen, elapsed, histories, state, macro_states)
+                rows[row] = p * q
+        return rows
 
     def intervals(self, row):
         """Every way in which the interval that starts at `row` can turn out: a list of Interval."""
         if row not in self._intervals:
-            first_step = (row.walked, row.elapsed[KEEPER], Fraction(1), Fraction(1))
-            self._intervals[row] = list(self._run(row, row.time, *first_step))
+            certain = Fraction(1)
+            steps = self._run(row, row.time, row.walked, row.elapsed[KEEPER], certain, discount=certain)
+            self._intervals[row] = list(steps)
         return self._intervals[row]
 
     def _run(self, row, time, walked, tidied, probability, discount):
+        """Yields the Intervals that begin with a step at `time`. walked, tidied: for how many steps so far."""
         trip, keeping = row.macros
         arrives = walked + 1 == STEPS[trip]
-        keeper_ends = Fraction(1) if keeping == "open" or tidied == 1 else Fraction(int(self.random_tidy), 2)
+        if keeping == "open" or tidied == 1:
+            keeper_ends = Fraction(1)
+        else:
+            keeper_ends = Fraction(1, 2) if self.random_tidy else Fraction(0)
         for ends, chance in ((True, keeper_ends), (False, 1 - keeper_ends)):
             if not chance:
                 continue
+            p = probability * chance
+            after_step = discount * self.gamma
             if not arrives and not ends:
-                yield from self._run(row, time + 1, walked + 1, tidied + 1, probability * chance, discount * self.gamma)
+                yield from self._run(row, time + 1, walked + 1, tidied + 1, p, after_step)
                 continue
+            trips = row.trips + 1 if arrives else row.trips
+            last = trips == TRIPS
+            ended = (arrives or last, ends or last)
             reward = discount * PAY[trip] if arrives and keeping == "open" else Fraction(0)
-            trips, last = row.trips + arrives, row.trips + arrives == TRIPS
-            after = {}
+            next_rows = {}
             if not last:
-                seen = ((trip, keeping == "open"), (keeping,))  # macro-action and macro-observation, if it has one
-                ended = (arrives, ends)
-                histories = tuple((*h, new) if e else h for h, new, e in zip(row.histories, seen, ended, strict=True))
                 elapsed = (0 if arrives else walked + 1, 0 if ends else tidied + 1)
-                after = self._choose(
-                    trips, elapsed[CARRIER], time + 1, row.macros, ended, elapsed, histories, row.macro_states
-                )
-            yield Interval(
-                probability * chance,
-                reward,
-                Fraction(0) if last else discount * self.gamma,
-                self.state(row.trips, walked, time),
-                (arrives or last, ends or last),
-                after,
-            )
+                histories = self._grown(row, ended)
+                there = (trips, elapsed[CARRIER], time + 1)
+                next_rows = self._choose(*there, row.macros, ended, elapsed, histories, row.macro_states)
+            last_state = self.state(row.trips, walked, time)
+            yield Interval(p, reward, Fraction(0) if last else after_step, last_state, ended, next_rows)
+
+    def _grown(self, row, ended):
+        """The macro-histories after a row's interval. They grow by what ended, the carrier's also by what it sees."""
+        trip, keeping = row.macros
+        news = ((trip, keeping == "open"), (keeping,))
+        return tuple((*old, new) if end else old for old, new, end in zip(row.histories, news, ended, strict=True))
 
     def value(self, row):
         """Joint value of the situation: the expected discounted return from `row` on, given all there is to know."""
         if row not in self._values:
-            self._values[row] = sum(i.probability * self.outcome(i) for i in self.intervals(row))
+            outcomes = [i.probability * self.outcome(i) for i in self.intervals(row)]
+            self._values[row] = sum(outcomes)
         return self._values[row]
 
     def outcome(self, interval):
         """Expected return from the interval's row on, given that the interval turns out like this."""
         values = {row: self.value(row) for row in interval.next_rows}
-        mean = sum(p * values[row] for row, p in interval.next_rows.items())
-        return interval.reward + interval.discount * (max(values.values(), default=0) if self.optimal else mean)
+        if self.optimal:
+            then = max(values.values(), default=0)
+        else:
+            then = sum(p * values[row] for row, p in interval.next_rows.items())
+        return interval.reward + interval.discount * then
 
     @cached_property
     def rows(self):
         """{Row: expected visits per episode} of every reachable decision situation."""
-        visits, wave = defaultdict(Fraction), self.start_rows()
+        visits = defaultdict(Fraction)
+        wave = self.start_rows()
         while wave:
             following = defaultdict(Fraction)
             for row, weight in wave.items():
@@ -184,12 +211,12 @@ def mixer_state(name, row, interval=None):
         name: one of INPUTS. "joint": the joint macro-state. "single_chose": the macro-state of the agent whose last
             macro-action ended just before the row, so that it chose there. "single_ends": of the agent whose
             macro-action ends with the row's interval, as in the worked example on Fig. 2. (Of several agents, the
-            first.) "real": the true state at the interval's last step. "decision": the true state at the row.
-            "decision+elapsed": and the steps for which each macro-action has run.
+            first.) "real" and "real-both": the true state at the interval's last step. "decision": the true state at
+            the row. "decision+elapsed": and the steps for which each macro-action has run.
         row: Row.
         interval: the Interval that followed `row`, for the prediction Q. None: for the target Q', where it is not
-            known; "real" is then the state right after the interval before, and "single_ends" the macro-state just
-            taken by the agent that ended with it (Fig. 2): both are the state at the row.
+            used. "real" is then the state right after the interval before, and "single_ends" the macro-state just
+            taken by the agent that ended with it (Fig. 2): both are the state at the row. ("real-both" does use it.)
 
     Returns:
         A tuple.
@@ -202,7 +229,9 @@ def mixer_state(name, row, interval=None):
         return row.state, row.elapsed
     if name == "decision" or interval is None:
         return row.state
-    return interval.last_state if name == "real" else row.macro_states[interval.ended.index(True)]
+    if name == "single_ends":
+        return row.macro_states[interval.ended.index(True)]
+    return interval.last_state
 
 
 def view(name, row):
@@ -216,11 +245,12 @@ def view(name, row):
     Returns:
         A tuple.
     """
-    return {
+    views = {
         "actions": row.macros,
         "chosen": (row.macros, row.chosen),
         "histories": (row.macros, row.chosen, row.histories),
-    }[name]
+    }
+    return views[name]
 
 
 def witness(process, state_name, view_name):
@@ -241,7 +271,11 @@ def witness(process, state_name, view_name):
 
 def is_function_of_row(process, state_name):
     """Whether each situation has one input: False if the input tells how the interval turned out."""
-    return all(len({mixer_state(state_name, row, i) for i in process.intervals(row)}) == 1 for row in process.rows)
+    for row in process.rows:
+        inputs = {mixer_state(state_name, row, i) for i in process.intervals(row)}
+        if len(inputs) > 1:
+            return False
+    return True
 
 
 def learned(process, state_name, view_name):
@@ -250,10 +284,12 @@ def learned(process, state_name, view_name):
     Returns:
         {(state, view): Fraction} over every input that occurs in training.
     """
-    weight, total = defaultdict(Fraction), defaultdict(Fraction)
+    weight = defaultdict(Fraction)
+    total = defaultdict(Fraction)
     for row, visits in process.rows.items():
         for interval in process.intervals(row):
-            key, mass = (mixer_state(state_name, row, interval), view(view_name, row)), visits * interval.probability
+            key = mixer_state(state_name, row, interval), view(view_name, row)
+            mass = visits * interval.probability
             weight[key] += mass
             total[key] += mass * process.outcome(interval)
     return {key: total[key] / weight[key] for key in weight}
@@ -265,7 +301,8 @@ def value_error(process, state_name, view_name):
     Returns:
         Fraction.
     """
-    fit, error = learned(process, state_name, view_name), Fraction(0)
+    fit = learned(process, state_name, view_name)
+    error = Fraction(0)
     for row, visits in process.rows.items():
         for interval in process.intervals(row):
             guess = fit[mixer_state(state_name, row, interval), view(view_name, row)]
@@ -276,17 +313,29 @@ def value_error(process, state_name, view_name):
 def target_error(process, state_name, view_name):
     """What goes wrong when the target Q' of Eq. 14 asks `learned` for the value of the next row.
 
+    With "real-both" the answer depends on how that row's interval turns out. The mean over that is taken.
+
     Returns:
         unseen: share of the rows asked about whose input never occurs in training, Fraction.
         error: mean squared distance from the joint value over the other rows asked about, Fraction.
     """
-    fit, asked = learned(process, state_name, view_name), defaultdict(Fraction)
+    fit = learned(process, state_name, view_name)
+    asked = defaultdict(Fraction)
     for row, visits in process.rows.items():
         for interval in process.intervals(row):
             for after, p in interval.next_rows.items():
                 asked[after] += visits * interval.probability * p
-    keys = {row: (mixer_state(state_name, row), view(view_name, row)) for row in asked}
-    known = [row for row in asked if keys[row] in fit]
-    total, answered = sum(asked.values()), sum(asked[row] for row in known)
-    error = sum(asked[row] * (fit[keys[row]] - process.value(row)) ** 2 for row in known)
-    return 1 - answered / total, error / answered
+    answered = Fraction(0)
+    error = Fraction(0)
+    for row, visits in asked.items():
+        answer = Fraction(0)
+        for interval in process.intervals(row):
+            known = interval if state_name == "real-both" else None
+            key = mixer_state(state_name, row, known), view(view_name, row)
+            if key not in fit:
+                break
+            answer += interval.probability * fit[key]
+        else:
+            answered += visits
+            error += visits * (answer - process.value(row)) ** 2
+    return 1 - answered / sum(asked.values()), error / answered

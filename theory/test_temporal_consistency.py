@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 from functools import cache
+from itertools import product
 
 import pytest
 
@@ -28,13 +29,17 @@ from theory.process import (
 HALF = Fraction(1, 2)
 delivery = cache(Delivery)
 
-# What the mixer sees besides its state:  m only, and who chose, and the macro-histories.
-NEVER, WITH_CHOSEN, WITH_HISTORIES, ALWAYS = (False,) * 3, (False, True, True), (False, False, True), (True,) * 3
+# Whether an input determines the value, by what the mixer sees besides: m only, and who chose, and the histories.
+NEVER = (False, False, False)
+WITH_HISTORIES = (False, False, True)
+WITH_CHOSEN = (False, True, True)
+ALWAYS = (True, True, True)
 RANDOM = {
     "joint": (ALWAYS, ALWAYS, NEVER),  # in the order of SHOWS: position, clock, trips
     "single_chose": (WITH_CHOSEN, WITH_HISTORIES, NEVER),
     "single_ends": (NEVER, NEVER, NEVER),
     "real": (NEVER, NEVER, NEVER),
+    "real-both": (NEVER, NEVER, NEVER),
     "decision": (WITH_CHOSEN, WITH_HISTORIES, NEVER),
     "decision+elapsed": (ALWAYS, ALWAYS, ALWAYS),
 }
@@ -43,6 +48,7 @@ DETERMINISTIC = {  # gamma = 1/2
     "single_chose": (WITH_CHOSEN, WITH_HISTORIES, WITH_HISTORIES),
     "single_ends": (WITH_HISTORIES, WITH_HISTORIES, WITH_HISTORIES),
     "real": (WITH_HISTORIES, WITH_HISTORIES, WITH_HISTORIES),
+    "real-both": (WITH_HISTORIES, WITH_HISTORIES, WITH_HISTORIES),
     "decision": (WITH_CHOSEN, WITH_HISTORIES, WITH_HISTORIES),
     "decision+elapsed": (ALWAYS, ALWAYS, ALWAYS),
 }
@@ -52,34 +58,36 @@ def determines(process, state_name):
     return tuple(witness(process, state_name, view_name) is None for view_name in VIEWS)
 
 
-every_input, every_state = pytest.mark.parametrize("name", INPUTS), pytest.mark.parametrize("shows", SHOWS)
+every_input = pytest.mark.parametrize("name", INPUTS)
+every_state = pytest.mark.parametrize("shows", SHOWS)
 of_uniform_and_best_play = pytest.mark.parametrize("optimal", [False, True])
 
 
-# The process itself.
-
-
+# ---- the process itself ---------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("random_tidy", [True, False])
 @pytest.mark.parametrize("gamma", [1, HALF])
 @of_uniform_and_best_play
 def test_values_against_a_recursion_over_single_steps(random_tidy, gamma, optimal):
     def by_steps(trips, walked, ran, trip, keeping):
         """Expected return just before a step, the keeper's macro-action having run for `ran` steps."""
-        total, arrives = Fraction(0), walked + 1 == STEPS[trip]
-        for ends in (True, False):
-            if keeping == "open" or ran == 1:
-                chance = Fraction(ends)
-            else:
-                chance = HALF if random_tidy else Fraction(not ends)
-            total += chance * (PAY[trip] if arrives and keeping == "open" else 0)
-            if chance and trips + arrives < TRIPS:
+        arrives = walked + 1 == STEPS[trip]
+        if keeping == "open" or ran == 1:
+            ends_with = Fraction(1)  # probability
+        else:
+            ends_with = HALF if random_tidy else Fraction(0)
+        total = Fraction(PAY[trip] if arrives and keeping == "open" else 0)
+        if arrives and trips + 1 == TRIPS:
+            return total
+        for ends, chance in ((True, ends_with), (False, 1 - ends_with)):
+            if chance:
                 then = (trips + 1, 0) if arrives else (trips, walked + 1)
-                values = [
-                    by_steps(*then, 0 if ends else ran + 1, new_trip, new_keeping)
-                    for new_trip in (STEPS if arrives else [trip])
-                    for new_keeping in (("open", "tidy") if ends else [keeping])
-                ]
-                total += chance * gamma * (max(values) if optimal else sum(values) / len(values))
+                new_trips = STEPS if arrives else [trip]
+                new_keepings = ("open", "tidy") if ends else [keeping]
+                values = []
+                for new_trip, new_keeping in product(new_trips, new_keepings):
+                    values.append(by_steps(*then, 0 if ends else ran + 1, new_trip, new_keeping))
+                best_or_mean = max(values) if optimal else sum(values) / len(values)
+                total += chance * gamma * best_or_mean
         return total
 
     process = delivery("trips", random_tidy, gamma, optimal=optimal)
@@ -91,7 +99,10 @@ def test_values_against_a_recursion_over_single_steps(random_tidy, gamma, optima
 
 def test_values_by_hand():
     process = delivery("trips")
-    last_trip = {(r.macros, r.walked, r.chosen): process.value(r) for r in process.rows if r.trips == 1}
+    last_trip = {}
+    for row in process.rows:
+        if row.trips == 1:
+            last_trip[row.macros, row.walked, row.chosen] = process.value(row)
     assert last_trip[("cart", "open"), 2, (False, True)] == 2
     assert last_trip[("cart", "open"), 1, (False, True)] == 1  # opens again with probability 1/2
     assert last_trip[("cart", "tidy"), 1, (False, True)] == HALF  # 1/2 done in time, 1/2 opens, pays 2
@@ -100,15 +111,14 @@ def test_values_by_hand():
 
 def test_every_row_is_a_decision_and_macro_states_date_from_the_last_choice():
     for row in delivery("clock").rows:
-        assert any(row.chosen) and row.state == (row.trips, row.time)
+        assert any(row.chosen)
+        assert row.state == (row.trips, row.time)
         for i in (CARRIER, KEEPER):
             assert row.chosen[i] == (row.elapsed[i] == 0)
             assert row.macro_states[i][1] == row.time - row.elapsed[i]
 
 
-# Which input determines the joint value.
-
-
+# ---- which input determines the joint value -------------------------------------------------------------------------
 @every_input
 @every_state
 @pytest.mark.parametrize("gamma", [1, HALF])
@@ -128,7 +138,7 @@ def test_what_each_input_determines_without_chance(name, shows, optimal):
 @every_state
 def test_which_inputs_are_functions_of_the_situation(name, shows):
     """The real state and the macro-state of whoever ends tell how the interval will turn out."""
-    leaks = name in ("real", "single_ends") and shows != "trips"
+    leaks = name in ("real", "real-both", "single_ends") and shows != "trips"
     assert is_function_of_row(delivery(shows), name) != leaks
     assert is_function_of_row(delivery(shows, False), name)
 
@@ -137,8 +147,10 @@ def test_which_inputs_are_functions_of_the_situation(name, shows):
 @every_state
 def test_a_perfect_fit_is_right_iff_the_input_determines_the_value_and_leaks_nothing(name, shows):
     process = delivery(shows)
+    leaks_nothing = is_function_of_row(process, name)
     for view_name, determined in zip(VIEWS, determines(process, name), strict=True):
-        assert (value_error(process, name, view_name) == 0) == (determined and is_function_of_row(process, name))
+        is_right = value_error(process, name, view_name) == 0
+        assert is_right == (determined and leaks_nothing)
 
 
 @pytest.mark.parametrize(
@@ -146,22 +158,25 @@ def test_a_perfect_fit_is_right_iff_the_input_determines_the_value_and_leaks_not
 )
 def test_elapsed_time_is_missing(shows, name, view_name):
     """Second trip, by cart, the keeper opens now: worth 2 if this is the last step, 1 if it is the one before."""
-    process, pairs = delivery(shows), {}
+    process = delivery(shows)
+    pairs = {}
     for row in process.rows:
         if row.trips == 1 and row.macros == ("cart", "open") and row.chosen == (False, True):
             key = mixer_state(name, row), view(view_name, row)
-            pairs.setdefault(key, set()).add((row.elapsed[CARRIER], process.value(row)))
+            pair = row.elapsed[CARRIER], process.value(row)
+            pairs.setdefault(key, set()).add(pair)
     assert {(1, 1), (2, 2)} in pairs.values()  # (steps for which the cart has run, value)
 
 
 def test_a_mixer_that_does_not_know_who_is_ongoing():
     """Second trip begins by cart, the keeper tidies: 7/8 if it has just begun to, 3/4 if it is at its second step."""
-    process, name = delivery("position"), "decision"
-    rows = [r for r in process.rows if (r.trips, r.walked, r.macros) == (1, 0, ("cart", "tidy"))]
-    assert {(r.chosen, mixer_state(name, r), process.value(r)) for r in rows} == {
-        ((True, True), (1, 0), Fraction(7, 8)),
-        ((True, False), (1, 0), Fraction(3, 4)),
-    }
+    process = delivery("position")
+    found = {}
+    for row in process.rows:
+        if (row.trips, row.walked, row.macros) == (1, 0, ("cart", "tidy")):
+            assert mixer_state("decision", row) == (1, 0)
+            found.setdefault(row.chosen, set()).add(process.value(row))
+    assert found == {(True, True): {Fraction(7, 8)}, (True, False): {Fraction(3, 4)}}
     assert witness(process, "joint", "actions") is None  # the joint macro-state tells who chose, here
 
 
@@ -170,40 +185,46 @@ def test_macro_state_of_an_agent_that_chose_is_the_decision_state(shows):
     """So `single_chose` is `decision`, and the joint macro-state with who chose contains it."""
     for row in delivery(shows).rows:
         assert mixer_state("single_chose", row) == mixer_state("decision", row) == row.state
-        assert {s for s, chose in zip(row.macro_states, row.chosen, strict=True) if chose} == {row.state}
+        for macro_state, chose in zip(row.macro_states, row.chosen, strict=True):
+            assert macro_state == row.state or not chose
 
 
 def test_macro_state_of_the_agent_that_ends_can_be_worse_than_the_real_state():
     """In mean squared error: worse if the mixer sees m only, better if it sees who chose; exact in neither."""
     process = delivery("position")
-    ends, real = ({v: value_error(process, name, v) for v in VIEWS} for name in ("single_ends", "real"))
-    assert ends["actions"] > real["actions"] and 0 < ends["chosen"] < real["chosen"]
+    error = {}
+    for name in ("single_ends", "real"):
+        for view_name in ("actions", "chosen"):
+            error[name, view_name] = value_error(process, name, view_name)
+    assert error["single_ends", "actions"] > error["real", "actions"]
+    assert 0 < error["single_ends", "chosen"] < error["real", "chosen"]
 
 
 def test_temporal_inconsistency_does_no_harm_by_itself():
     """The decision state is of another date than the ongoing agents' histories, and still determines every value."""
     process = delivery("position")
-    dated_otherwise = [row for row in process.rows if any(s != row.state for s in row.macro_states)]
-    assert dated_otherwise and value_error(process, "decision", "chosen") == 0
+    dated_otherwise = [row for row in process.rows if row.macro_states != (row.state, row.state)]
+    assert dated_otherwise
+    assert value_error(process, "decision", "chosen") == 0
 
 
 @every_state
 def test_histories_matter_if_policies_use_them(shows):
     def opens_once(agent, history):
-        used_up = agent == KEEPER and ("open",) in history
-        return {"tidy": Fraction(1)} if used_up else uniform(agent, history)
+        if agent == KEEPER and ("open",) in history:
+            return {"tidy": Fraction(1)}
+        return uniform(agent, history)
 
     process = Delivery(shows, policy=opens_once)
     assert determines(process, "decision+elapsed") == WITH_HISTORIES
     assert determines(process, "joint") == (NEVER if shows == "trips" else WITH_HISTORIES)
 
 
-# The real state.
-
-
+# ---- the real state -------------------------------------------------------------------------------------------------
 def return_explained(process, name, view_name):
     """Second moment of E[return | input]: the higher, the better the input predicts the return."""
-    fit, total = learned(process, name, view_name), Fraction(0)
+    fit = learned(process, name, view_name)
+    total = Fraction(0)
     for row, visits in process.rows.items():
         for interval in process.intervals(row):
             guess = fit[mixer_state(name, row, interval), view(view_name, row)]
@@ -223,13 +244,16 @@ def test_the_real_state_is_not_noise_it_tells_the_outcome(view_name):
 def test_one_situation_two_real_states():
     """First trip, by cart, one step walked, the keeper tidies: worth 281/256, learned as two other values."""
     process = delivery("position")
-    (row,) = (
-        r for r in process.rows if r.time == 1 and r.macros == ("cart", "tidy") and r.histories == ((), (("tidy",),))
-    )
+    macros = ("cart", "tidy")
+    histories = ((), (("tidy",),))
+    (row,) = [row for row in process.rows if (row.time, row.macros, row.histories) == (1, macros, histories)]
     assert process.value(row) == Fraction(281, 256)
     fit = learned(process, "real", "histories")
-    fed = {mixer_state("real", row, i) for i in process.intervals(row)}
-    assert {s: fit[s, view("histories", row)] for s in fed} == {(0, 1): Fraction(205, 128), (0, 2): Fraction(29, 48)}
+    found = {}
+    for interval in process.intervals(row):
+        state = mixer_state("real", row, interval)
+        found[state] = fit[state, view("histories", row)]
+    assert found == {(0, 1): Fraction(205, 128), (0, 2): Fraction(29, 48)}
 
 
 @pytest.mark.parametrize("name", INPUTS)
@@ -239,24 +263,44 @@ def test_only_real_and_single_ends_mean_another_state_in_the_target(name, random
     process = delivery("position", random_tidy)
     for view_name in VIEWS:
         unseen, error = target_error(process, name, view_name)
-        if name not in ("real", "single_ends"):
-            assert unseen == 0 and (error == 0) == (value_error(process, name, view_name) == 0)
-        else:
+        if name in ("real", "single_ends"):
             assert unseen > 0 or error > 0
+        else:
+            assert unseen == 0
+            assert (error == 0) == (value_error(process, name, view_name) == 0)
 
 
 def test_real_state_without_chance_predicts_exactly_and_bootstraps_wrongly():
     """Deterministic, undiscounted, progress visible: no noise. The target still takes the input for another row's."""
     process = delivery("position", False)
-    assert all(value_error(process, "real", view_name) == 0 for view_name in VIEWS)
+    for view_name in VIEWS:
+        assert value_error(process, "real", view_name) == 0
     unseen, error = target_error(process, "real", "actions")
-    assert unseen == 0 and error > Fraction(1, 8)  # answers, with the value of a later moment
+    assert unseen == 0
+    assert error > Fraction(1, 8)  # it answers, with the value of a later moment
     unseen, error = target_error(process, "real", "chosen")
-    assert unseen > Fraction(1, 5) and error == 0  # has never been asked
+    assert unseen > Fraction(1, 5)  # it has never been asked
+    assert error == 0
+
+
+@pytest.mark.parametrize("view_name", VIEWS)
+def test_real_state_in_both_predicts_as_wrongly_and_bootstraps_rightly(view_name):
+    """Q' is fed the end of its own interval, too: the leak averages out, so the dates are what spoils the target."""
+    assert target_error(delivery("position", False), "real-both", view_name) == (0, 0)
+    process = delivery("position")
+    assert value_error(process, "real-both", view_name) == value_error(process, "real", view_name) > Fraction(3, 100)
+    _, error_of_real = target_error(process, "real", view_name)
+    unseen, error = target_error(process, "real-both", view_name)
+    assert unseen == 0
+    assert 0 < 5_000 * error < error_of_real
 
 
 def test_the_real_state_depends_on_the_macro_action_it_is_to_value():
     """So Mac-IGM, a demand at one fixed input, compares it with joint actions that would have led to another input."""
     process = delivery("position", False)
-    first = {row.macros: mixer_state("real", row, process.intervals(row)[0]) for row in process.start_rows()}
-    assert first["hand", "open"] == (0, 0) and first["hand", "tidy"] == (0, 1)
+    first = {}
+    for row in process.start_rows():
+        (interval,) = process.intervals(row)
+        first[row.macros] = mixer_state("real", row, interval)
+    assert first["hand", "open"] == (0, 0)
+    assert first["hand", "tidy"] == (0, 1)
