@@ -383,7 +383,7 @@ def train(args):
 
         wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
     writer = SummaryWriter(folder, purge_step=step + 1)  # drops what was logged after the checkpoint
-    print(folder)
+    print(folder, flush=True)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
     saved_at = -np.inf  # so there is a checkpoint from the first step on
 

@@ -115,7 +115,7 @@ def run_job(job):
 
 
 def run_script(job, folder, log):
-    """Runs a job's script, or goes on with a run folder, until it ends or `stop` has a signal; returns its exit code."""
+    """Runs a job's script, or goes on with a folder, until it ends or `stop` has a signal; returns its exit code."""
     new = [f"--env={job['env']}", f"--seed={job['seed']}", f"--runs-dir={job['place']}", *job["options"]]
     command = [str(record.ROOT / f"{job['algorithm']}.py"), *([f"--resume={folder}"] if folder else new)]
     print(time.strftime("=== %F %T"), os.uname().nodename, shlex.join(command), file=log, flush=True)

@@ -108,11 +108,11 @@ def test_what_cannot_be_started_is_refused():
     with pytest.raises(ValueError, match=message):
         env.step(given)
     for outside in (-1, 3, 99):
-        with pytest.raises(ValueError, match=rf"agent 0 of environment 1 was given macro-action {outside}: it has 0\.\.2"):
+        with pytest.raises(ValueError, match=rf"agent 0 .* was given macro-action {outside}: it has 0\.\.2"):
             env.step(np.array([[WAIT, TAKE], [outside, TAKE]]))
     assert env.elapsed.tolist() == [1, 1], "a step that was refused has not been taken"
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"agent 1 of environment 0 was given macro-action 2: it has 0\.\.1"):
+    with pytest.raises(ValueError, match=r"agent 1 .* was given macro-action 2: it has 0\.\.1"):
         env.step(np.array([[NAP, NAP], [NAP, TAKE]]))
 
 
@@ -128,7 +128,6 @@ def test_a_free_agent_must_be_able_to_start_something(monkeypatch):
     with pytest.raises(ValueError, match="agent 1 of environment 0 is free, but its initiation set is empty"):
         env.step(np.array([[TAKE, WAIT], [TAKE, TAKE]]))
 
-
     def never_at_the_end(self):
         return np.ones((2, 2, 3), bool) & (self.elapsed < 7)[:, None, None]
 
@@ -143,7 +142,7 @@ def test_a_saved_state_knows_what_is_available():
     env = envs.make("orchard", 3)
     rng = np.random.default_rng(0)
     env.reset(seed=0)
-    for _ in range(7):
+    for _ in range(3):
         actions = np.where(env.available, rng.random(env.available.shape), -1.0).argmax(2)
         _, _, _, _, infos = env.step(actions)
     assert not infos["macro_done"].all() and infos["macro_done"].any()
@@ -303,7 +302,8 @@ def test_every_script_takes_all_the_fruit(monkeypatch, tmp_path, script):
     batches = Spy(monkeypatch, script, "make_batch")
     settings = dict(num_envs=8, hidden_size=32, eval_episodes=1, reward_scale=0.2, gamma=0.97, eval_frequency=1_200)
     if script is mac_iaicc:
-        settings |= dict(total_timesteps=6_000, exploration_timesteps=3_000, batch_size=16, learning_rate=0.01)
+        settings |= dict(total_timesteps=6_000, exploration_timesteps=4_000, start_e=1.0, batch_size=16)
+        settings |= dict(learning_rate=0.01)
     else:
         settings |= dict(total_timesteps=4_800, learning_starts=400, exploration_timesteps=2_000, learning_rate=0.005)
         settings |= dict(train_frequency=20, polyak=0.95)

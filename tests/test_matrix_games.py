@@ -217,7 +217,7 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
         hidden_size=16,
         eval_episodes=1,
         reward_scale=1.0,
-        total_timesteps=5_600,
+        total_timesteps=4_800,
         learning_starts=1_600,
         train_frequency=16,
         end_e=1.0,
@@ -230,6 +230,6 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
     for beta in (0.3, 1.0):
         found[beta] = []
         script.train(script.Args(hysteresis=beta, **shared))
-        push, leave = np.mean(found[beta][-50:], 0)
+        push, leave = np.mean(found[beta][-60:], 0)
         assert optimism.value(beta, *game.values(), gamma) == pytest.approx({0.3: 7.0, 1.0: -0.08}[beta], abs=0.01)
         assert push == pytest.approx({0.3: 7.0, 1.0: -0.08}[beta], abs=1) and leave == pytest.approx(2, abs=0.3)

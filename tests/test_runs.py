@@ -136,7 +136,7 @@ def processes():
 def test_killed_and_resumed_equals_undisturbed(tmp_path, processes, script):
     """With checkpoints at every step, so that the kill may come in the middle of one, too."""
     module = importlib.import_module(script)
-    options = dict(seed=5, exploration_timesteps=400, total_timesteps=800, eval_frequency=200)
+    options = dict(seed=5, exploration_timesteps=200, total_timesteps=600, eval_frequency=200)
     undisturbed = module.train(short(module, TASKS[script], tmp_path / "whole", **options))
     args = short(module, TASKS[script], tmp_path / "cut", checkpoint_frequency=0.0, **options)
     process = processes.Process(target=train_in_process, args=(script, args))
@@ -145,30 +145,30 @@ def test_killed_and_resumed_equals_undisturbed(tmp_path, processes, script):
     process.kill()
     process.join()
     (folder,) = (tmp_path / "cut").iterdir()
-    assert process.exitcode == -signal.SIGKILL and 0 < reached(folder) < 800, "the run was cut before its end"
+    assert process.exitcode == -signal.SIGKILL and 0 < reached(folder) < 600, "the run was cut before its end"
     resume(module, folder)
     assert_same_run(undisturbed, folder)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_interrupted_and_resumed_equals_undisturbed(tmp_path, monkeypatch, script):
-    """Ctrl-C comes at step 720 of 1,000, the last checkpoint is of step 616, and episodes have ended in between.
+    """Ctrl-C comes at step 520 of 700, the last checkpoint is of step 412, and episodes have ended in between.
 
     The clock moves on by a second whenever somebody looks at it, which is once a step, and once a checkpoint.
     """
     module = importlib.import_module(script)
     cut_episodes(monkeypatch, 17)
-    options = dict(seed=0, exploration_timesteps=400, total_timesteps=1_000, eval_frequency=200)
+    options = dict(seed=0, exploration_timesteps=200, total_timesteps=700, eval_frequency=200)
     undisturbed = module.train(short(module, TASKS[script], tmp_path / "whole", **options))
     args = short(module, TASKS[script], tmp_path / "cut", checkpoint_frequency=50.0, **options)
     seconds = iter(range(10_000))
     with monkeypatch.context() as patch:
         clock = types.SimpleNamespace(monotonic=lambda: next(seconds), time_ns=time.time_ns)
         patch.setattr(module, "time", clock)
-        folder = interrupted(patch, module, args, steps=180)
-    assert reached(folder) == 616
+        folder = interrupted(patch, module, args, steps=130)
+    assert reached(folder) == 412
     stale = scalars(folder)
-    assert stale["charts/episodic_return"][-1][0] > 616, "what was logged after the checkpoint is dropped below"
+    assert stale["charts/episodic_return"][-1][0] > 412, "what was logged after the checkpoint is dropped below"
     remembered = module.load(folder / "checkpoint.pt")["hidden"]
     acted = []
     act = module.act

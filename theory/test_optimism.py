@@ -46,8 +46,8 @@ def test_what_a_team_has_learned_is_read(tmp_path, script):
     """Values of two choices that are not the same, in units of rewards, not of scaled ones."""
     found = []
     for reward_scale in (0.1, 0.01):
-        args = args_for(script, "bp-10", runs_dir=str(tmp_path), reward_scale=reward_scale, **TINY)
-        found.append(optimism.learned(script, args))
+        options = {**TINY, "total_timesteps": 600, "runs_dir": str(tmp_path), "reward_scale": reward_scale}
+        found.append(optimism.learned(script, args_for(script, "bp-10", **options)))
     assert np.isfinite(found).all()
     assert found[0][0] != found[0][1]
     assert abs(found[1][0]) > 2 * abs(found[0][0]), "networks say about the same, whatever a reward is scaled to"
