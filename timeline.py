@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from envs.rendering import ALARM, ARM, GREEN_DARK, INK, MUTED, WHITE, _colours
+from envs.rendering import ALARM, ARM, GREEN_DARK, INK, MUTED, WHITE, agent_colours
 
 WIDTH = 800  # of the figure
 LEFT = 80  # from the left edge of the figure to the strips
@@ -217,7 +217,7 @@ class Strip:
         """Draws an agent's bars, dots where it chooses, and names below the bars."""
         label = self.episode.labels[agent]
         names = self.episode.names[agent]
-        color, _ = _colours(label)
+        color, _ = agent_colours(label)
         y = self.middle(agent)
         self.label(y, f"agent {label}")
         bars = [bar for bar in self.episode.bars(agent) if bar.start < self.last and bar.end > self.first]

@@ -1,364 +1,754 @@
-"""Pictures of the three domains, drawn with Pillow: a scene, and beside or below it what every agent is doing.
+"""Pictures of the three domains, drawn with Pillow: a scene, and beside or below it a panel about every agent.
 
-Everything is drawn at twice the size and then reduced, which smooths the edges. Lengths and positions are in pixels of
-the finished picture, y downwards.
+Lengths and positions are in pixels of the finished picture, and y grows downwards. A `Canvas` draws everything larger
+and reduces it at the end, which smooths the edges.
 """
 
-from copy import copy
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
-from math import ceil, cos, hypot, pi, sin, sqrt
+from math import ceil, cos, dist, hypot, pi, sin, sqrt
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-MARGIN, BOARD, PANEL, ROOM = 20, 560, 260, (860, 640)  # the margin, the widest grid, the panel, the widest warehouse
-HEADER, ROW = 150, 36  # heights of a panel's head and of an agent's entry
-METRE = 95  # of the warehouse, before it is made to fit
+from envs.warehouse import LAST_PHASE, NO_TOOL, PHASES
 
-# Okabe and Ito's colours, which can be told apart with any kind of colour vision, and neutral ones around them.
-GREEN, PURPLE, SKY, YELLOW, SLATE = "#009e73", "#cc79a7", "#56b4e9", "#f0e442", "#46525e"
-INK, MUTED, LINE, PAPER, WHITE = "#22303c", "#6e7b87", "#dbe2e8", "#f4f6f8", "#ffffff"
-ALARM, ALARM_PALE, GREEN_PALE, GREEN_DARK = "#c8102e", "#fbe1e1", "#d9f0e6", "#00604a"
-WOOD, WOOD_DARK = "#e5c79c", "#8a6534"
-AGENTS = [("#0072b2", WHITE), ("#e69f00", INK), (GREEN, WHITE), ("#d55e00", WHITE), (PURPLE, INK), (SKY, INK)]
-AGENTS += [(YELLOW, INK), (SLATE, WHITE), ("#004a75", WHITE), ("#8f6300", WHITE)]  # (disc, number)
-TOOLS = ((3, 1.25, PURPLE), (4, 1.15, YELLOW), (6, 1.05, SKY))  # corners, relative size and colour of each kind
-PILLS = {"free": (LINE, MUTED), "ended": (GREEN_PALE, GREEN_DARK), "running": (SLATE, WHITE)}
-ARM = "A"
+ENLARGED = 2  # how many times larger everything is drawn
+MARGIN = 20  # around the scene and the panel
+GRID_SIDE = 560  # of the largest grid
+ROOM_WIDTH = 860  # of the largest warehouse
+ROOM_HEIGHT = 640
+METRE = 95  # in a warehouse, before the warehouse is scaled to fit
+PANEL = 260  # width of a panel, or of one of its columns
+HEADER = 150  # height of a panel's head
+ENTRY = 36  # height of an agent's entry in a panel
+SMALL = 12  # size of small text
 
-_font = lru_cache(ImageFont.load_default)
+# Okabe and Ito's colours, which can be told apart with any kind of colour vision.
+GREEN = "#009e73"
+PURPLE = "#cc79a7"
+SKY = "#56b4e9"
+YELLOW = "#f0e442"
+# Neutral colours, from dark to light.
+INK = "#22303c"
+SLATE = "#46525e"
+MUTED = "#6e7b87"
+LINE = "#dbe2e8"
+PAPER = "#f4f6f8"
+WHITE = "#ffffff"
+# Other colours.
+ALARM = "#c8102e"
+ALARM_PALE = "#fbe1e1"
+GREEN_DARK = "#00604a"
+GREEN_PALE = "#d9f0e6"
+WOOD = "#e5c79c"
+WOOD_DARK = "#8a6534"
+
+ARM = "A"  # the label of the warehouse's arm; the label of any other agent is its number
+AGENTS = [  # colours of an agent's disc and of the label on it
+    ("#0072b2", WHITE),
+    ("#e69f00", INK),
+    (GREEN, WHITE),
+    ("#d55e00", WHITE),
+    (PURPLE, INK),
+    (SKY, INK),
+    (YELLOW, INK),
+    (SLATE, WHITE),
+    ("#004a75", WHITE),
+    ("#8f6300", WHITE),
+]
+STATUS = {  # colours of the field that says how an agent's macro-action stands, and of the word in it
+    "free": (LINE, MUTED),
+    "running": (SLATE, WHITE),
+    "ended": (GREEN_PALE, GREEN_DARK),
+}
+TOOLS = [  # corners, relative size and colour of each kind of tool
+    (3, 1.25, PURPLE),
+    (4, 1.15, YELLOW),
+    (6, 1.05, SKY),
+]
+HEADINGS = [  # (dx, dy) in a picture of the orientations of Box Pushing
+    (0, -1),  # north
+    (1, 0),  # east
+    (0, 1),  # south
+    (-1, 0),  # west
+]
 
 
+@cache
+def _font(size):
+    """The font that comes with Pillow, in a size."""
+    return ImageFont.load_default(size)
+
+
+@dataclass
 class Canvas:
-    """A picture of even width and height, or a part of it with an origin and a unit of length of its own."""
+    """A picture, or a part of one that has an origin and a unit of length of its own.
 
-    def __init__(self, width, height):
-        self.image = Image.new("RGB", (4 * ceil(width / 2), 4 * ceil(height / 2)), PAPER)
-        self.draw = ImageDraw.Draw(self.image)
-        self.x, self.y, self.unit = 0.0, 0.0, 2.0
+    The methods that draw take positions and lengths in this unit. `edge` and `thickness` say how thick a line is.
+    """
 
-    def at(self, x, y, unit=1.0):
-        """The part with the origin (x, y)."""
-        part = copy(self)
-        part.x, part.y, part.unit = self.x + x * self.unit, self.y + y * self.unit, self.unit * unit
-        return part
+    image: Image.Image  # the whole picture, enlarged
+    draw: ImageDraw.ImageDraw
+    origin_x: float = 0.0  # in pixels of the enlarged picture
+    origin_y: float = 0.0
+    unit: float = ENLARGED  # in pixels of the enlarged picture
 
-    def _points(self, points):
-        return [(self.x + x * self.unit, self.y + y * self.unit) for x, y in points]
+    @classmethod
+    def blank(cls, width, height):
+        """An empty picture. Width and height are rounded up to even numbers, which videos need."""
+        even_width = 2 * ceil(width / 2)
+        even_height = 2 * ceil(height / 2)
+        size = (ENLARGED * even_width, ENLARGED * even_height)
+        image = Image.new("RGB", size, PAPER)
+        return cls(image, ImageDraw.Draw(image))
 
-    def _width(self, line):
-        return max(1, round(line * self.unit))
+    def part(self, x, y, unit=1.0):
+        """The part of the picture whose origin is at (x, y) and whose unit of length is `unit`."""
+        left, top = self._enlarge(x, y)
+        return replace(self, origin_x=left, origin_y=top, unit=self.unit * unit)
 
-    def box(self, x, y, width, height, fill=None, outline=None, line=1.0, radius=0.0):
-        """(x, y) is the upper left corner."""
-        (x0, y0), (x1, y1) = self._points([(x, y), (x + width, y + height)])
-        corners = (round(x0), round(y0), max(round(x1), round(x0) + 1) - 1, max(round(y1), round(y0) + 1) - 1)
-        self.draw.rounded_rectangle(corners, radius * self.unit, fill, outline, self._width(line))
+    def box(self, x, y, width, height, fill, outline=None, edge=1.0, radius=0.0):
+        """Draws a rectangle with its upper left corner at (x, y). `radius` rounds its corners."""
+        left, top = self._enlarge(x, y)
+        right, bottom = self._enlarge(x + width, y + height)
+        left = round(left)
+        top = round(top)
+        right = max(round(right), left + 1)
+        bottom = max(round(bottom), top + 1)
+        corners = (left, top, right - 1, bottom - 1)  # Pillow draws the right column and the bottom row, too
+        self.draw.rounded_rectangle(corners, radius * self.unit, fill, outline, self._line_width(edge))
 
-    def disc(self, x, y, radius, fill=None, outline=None, line=1.0):
-        corners = self._points([(x - radius, y - radius), (x + radius, y + radius)])
-        self.draw.ellipse(corners, fill, outline, self._width(line))
+    def disc(self, x, y, radius, fill, outline, edge=1.5):
+        """Draws a disc around (x, y). If `fill` is None, it is only a circle."""
+        upper_left = self._enlarge(x - radius, y - radius)
+        lower_right = self._enlarge(x + radius, y + radius)
+        self.draw.ellipse([upper_left, lower_right], fill, outline, self._line_width(edge))
 
-    def line(self, points, fill, width=1.0):
-        self.draw.line(self._points(points), fill, self._width(width))
+    def polygon(self, points, fill, outline=None, edge=1.0):
+        """Draws a polygon whose corners are points (x, y)."""
+        corners = [self._enlarge(x, y) for x, y in points]
+        self.draw.polygon(corners, fill, outline, self._line_width(edge))
 
-    def dashes(self, start, end, fill):
-        count = int(hypot(end[0] - start[0], end[1] - start[1]) / 12) + 1
-        for dash in np.linspace(start, end, 2 * count).reshape(count, 2, 2).tolist():
-            self.line(dash, fill, 2)
+    def line(self, start, end, colour, thickness):
+        """Draws a straight line between two points (x, y)."""
+        ends = [self._enlarge(*start), self._enlarge(*end)]
+        self.draw.line(ends, colour, self._line_width(thickness))
 
-    def polygon(self, points, fill, outline=None, line=1.0):
-        self.draw.polygon(self._points(points), fill, outline, self._width(line))
+    def dashes(self, start, end, colour):
+        """Draws a dashed line between two points (x, y)."""
+        count = int(dist(start, end) / 12) + 1
+        points = np.linspace(start, end, 2 * count)
+        for dash_start, dash_end in points.reshape(count, 2, 2):
+            self.line(dash_start, dash_end, colour, thickness=2)
 
-    def text(self, x, y, words, size=14.0, fill=INK, anchor="l", bold=False):
-        """anchor: "l", "m" or "r", whether x is the left end, the middle or the right end; y is the middle."""
-        size = max(size * self.unit, 10)
-        (at,), stroke = self._points([(x, y)]), round(size / 44) if bold else 0
-        self.draw.text(at, str(words), fill, _font(size), anchor + "m", stroke_width=stroke)
+    def text(self, x, y, words, size=14.0, colour=INK, anchor="l", bold=False):
+        """Writes words. y is the middle of their height, and `anchor` says what x is.
+
+        With "l" x is the left end of the words, with "m" their middle and with "r" their right end.
+        """
+        font_size = max(size * self.unit, 10)
+        font = _font(font_size)
+        stroke = round(font_size / 44) if bold else 0
+        place = self._enlarge(x, y)
+        self.draw.text(place, str(words), colour, font, anchor + "m", stroke_width=stroke)
 
     def pixels(self):
-        """uint8 [height, width, 3]."""
-        return np.array(self.image.reduce(2))  # LANCZOS looks the same and takes several times as long
+        """The finished picture, uint8 [height, width, 3]."""
+        reduced = self.image.reduce(ENLARGED)  # LANCZOS looks the same and takes several times as long
+        return np.array(reduced)
+
+    def _enlarge(self, x, y):
+        """Where the point (x, y) is in the enlarged picture."""
+        return self.origin_x + x * self.unit, self.origin_y + y * self.unit
+
+    def _line_width(self, thickness):
+        """How many pixels of the enlarged picture a line is wide."""
+        return max(1, round(thickness * self.unit))
 
 
-# ---- what the pictures are made of ----------------------------------------------------------------------------------
-def _colours(label):
-    return (SLATE, WHITE) if label == ARM else AGENTS[label % len(AGENTS)]
+# ---- what several pictures are made of ------------------------------------------------------------------------------
+def agent_colours(label):
+    """The colours of an agent's disc and of the label on it. `label` is a number or ARM."""
+    if label == ARM:
+        return SLATE, WHITE
+    return AGENTS[label % len(AGENTS)]
 
 
 def _agent(canvas, x, y, radius, label, heading=None):
-    """A disc with the label, an agent's number or ARM; heading: (dx, dy) of length 1 gives it a nose."""
+    """Draws an agent as a disc with its label. A heading, which is a direction (dx, dy) of length 1, adds a nose."""
     if heading is not None:
-        dx, dy = np.multiply(heading, radius)
-        canvas.polygon([(x + a * dx - b * dy, y + a * dy + b * dx) for a, b in ((0.3, 1), (1.6, 0), (0.3, -1))], INK)
-    fill, ink = _colours(label)
-    canvas.disc(x, y, radius, fill, INK, radius / 12)
-    canvas.text(x, y, label, radius * 1.2, ink, "m", bold=radius > 12)
-
-
-def _tool(canvas, x, y, radius, kind, ghost=False):
-    """A tool: its number in its shape and colour; a ghost is one that is not there."""
-    corners, size, colour = TOOLS[kind]
-    y += 0.18 * radius * (corners == 3)  # a triangle's centre is below the middle of its height
-    first = pi / 4 if corners == 4 else -pi / 2
-    angles = [first + 2 * pi * corner / corners for corner in range(corners)]
-    shape = [(x + size * radius * cos(angle), y + size * radius * sin(angle)) for angle in angles]
-    canvas.polygon(shape, PAPER if ghost else colour, MUTED if ghost else INK, radius / 10)
-    canvas.text(x, y, kind, radius * 1.05, MUTED if ghost else INK, "m", bold=not ghost)
-
-
-def _cross(canvas, x, y, radius):
-    for slant in (-radius, radius):
-        canvas.line([(x - radius, y - slant), (x + radius, y + slant)], ALARM, radius / 3)
+        centre = np.array([x, y])
+        forward = radius * np.array(heading)
+        dx, dy = forward
+        sideways = np.array([-dy, dx])
+        base = centre + 0.3 * forward
+        tip = centre + 1.6 * forward
+        canvas.polygon([base + sideways, tip, base - sideways], INK)
+    disc_colour, label_colour = agent_colours(label)
+    is_large = radius > 12
+    canvas.disc(x, y, radius, disc_colour, INK, edge=radius / 12)
+    canvas.text(x, y, label, radius * 1.2, label_colour, anchor="m", bold=is_large)
 
 
 def _bar(canvas, x, y, width, height, share, colour):
-    canvas.box(x, y, width, height, LINE, radius=height / 2)
+    """Draws a bar of which a share is filled: nothing from 0 down, all of it from 1 up."""
+    radius = height / 2
+    canvas.box(x, y, width, height, LINE, radius=radius)
     if share > 0:
-        canvas.box(x, y, max(width * min(share, 1), height), height, colour, radius=height / 2)
+        filled = max(width * min(share, 1), height)
+        canvas.box(x, y, filled, height, colour, radius=radius)
 
 
 def _spread(points, gap):
-    """Points (x, y), pushed apart until no two are closer than the gap."""
+    """Moves points (x, y) apart until no two are closer than the gap, as far as twenty rounds can do it."""
     points = np.array(points, float)
     for _ in range(20):
         for first, second in combinations(range(len(points)), 2):
-            apart = points[second] - points[first] + (1e-6, 0)  # those on the same spot are put side by side
-            push = apart * max(gap / hypot(*apart) - 1, 0) / 2
+            way = points[second] - points[first]
+            way += (1e-6, 0)  # points on the same spot move apart sideways
+            lacking = max(gap / hypot(*way) - 1, 0)  # as a share of the way
+            push = way * lacking / 2
             points[first] -= push
             points[second] += push
     return points.tolist()
 
 
-def _header(canvas, env, index, title, subtitle):
-    """Title, step, return and how the episode stands."""
-    elapsed, over, success = env.elapsed[index], env.over[index], env.success[index]
-    status = "success" if success else "not started" if over and not elapsed else "ended" if over else "running"
-    values = f"{elapsed} / {env.horizon}", f"{env.episode_return[index]:.1f}", status
-    canvas.text(0, 11, title, 21, bold=True)
-    canvas.text(0, 37, subtitle + (", primitive actions" if env.primitive else ""), fill=MUTED)
-    for name, value, y in zip(("step", "return", "episode"), values, (68, 104, 128), strict=True):
-        canvas.text(0, y, name, fill=MUTED)
-        canvas.text(PANEL, y, value, fill=GREEN_DARK if value == "success" else INK, anchor="r")
-    _bar(canvas, 0, 79, PANEL, 6, elapsed / env.horizon, MUTED)
+def _header(panel, env, index, title, subtitle):
+    """Writes the title, the step, the return and how the episode stands."""
+    if env.primitive:
+        subtitle += ", primitive actions"
+    panel.text(0, 11, title, size=21, bold=True)
+    panel.text(0, 37, subtitle, colour=MUTED)
+
+    elapsed = env.elapsed[index]
+    _fact(panel, 68, "step", f"{elapsed} / {env.horizon}")
+    _bar(panel, 0, 79, PANEL, 6, elapsed / env.horizon, MUTED)
+    _fact(panel, 104, "return", f"{env.episode_return[index]:.1f}")
+    status = _episode_status(env, index)
+    status_colour = GREEN_DARK if status == "success" else INK
+    _fact(panel, 128, "episode", status, status_colour)
 
 
-def _agents(canvas, env, index, labels, notes):
-    """An entry for each agent: what it runs, whether that has just ended, and a note."""
-    for agent, (label, note) in enumerate(zip(labels, notes, strict=True)):
-        entry, action = canvas.at(0, ROW * agent), env.macro_action[index, agent]
-        status = "free" if action < 0 else "ended" if env.macro_done[index, agent] else "running"
+def _fact(panel, y, name, value, colour=INK):
+    """Writes a name at the left end of a panel and a value at its right end."""
+    panel.text(0, y, name, colour=MUTED)
+    panel.text(PANEL, y, value, colour=colour, anchor="r")
+
+
+def _episode_status(env, index):
+    """How the episode stands, in words."""
+    if env.success[index]:
+        return "success"
+    if not env.over[index]:
+        return "running"
+    if env.elapsed[index] == 0:
+        return "not started"
+    return "ended"
+
+
+def _agent_list(panel, env, index, labels, notes):
+    """Draws an entry for each agent: its label, its macro-action and how that stands, and a note."""
+    for agent, label in enumerate(labels):
+        entry = panel.part(0, ENTRY * agent)
+        action = env.macro_action[index, agent]
+        if action < 0:
+            name = "none yet"
+            status = "free"
+        else:
+            name = env.macro_action_names[agent][action]
+            status = "ended" if env.macro_done[index, agent] else "running"
         _agent(entry, 12, 18, 11, label)
-        entry.text(32, 10, "none yet" if action < 0 else env.macro_action_names[agent][action])
-        entry.text(32, 26, note, 12, MUTED)
-        entry.box(PANEL - 54, 2, 54, 18, PILLS[status][0], radius=9)
-        entry.text(PANEL - 27, 11, status, 12, PILLS[status][1], "m")
+        entry.text(32, 10, name)
+        entry.text(32, 26, notes[agent], SMALL, MUTED)
+        field_colour, word_colour = STATUS[status]
+        field = entry.part(PANEL - 54, 2)
+        field.box(0, 0, 54, 18, field_colour, radius=9)
+        field.text(27, 9, status, SMALL, word_colour, anchor="m")
 
 
-def _board(grid, panel_height):
-    """An empty grid with room for a panel on its right.
+class Board:
+    """A picture with an empty grid of cells and with room for a panel on its right.
 
-    Returns:
-        canvas, the panel's canvas, the cells' size, and a function from (x, y) in cells, y to the north, to pixels.
+    Attributes:
+        canvas: the whole picture.
+        panel: the part of it on the right.
+        cell_side: the side of a cell.
+        side: the side of the grid.
     """
-    cell = max(2, BOARD // grid)  # whole pixels keep the grid lines sharp
-    side = cell * grid
-    canvas = Canvas(side + PANEL + 3.5 * MARGIN, max(side, panel_height) + 2 * MARGIN)
-    canvas.box(MARGIN, MARGIN, side, side, WHITE)
-    for place in range(0, side + 1, cell):
-        canvas.box(MARGIN + place - 0.5, MARGIN, 1, side, LINE)
-        canvas.box(MARGIN, MARGIN + place - 0.5, side, 1, LINE)
-    panel = canvas.at(side + 2.5 * MARGIN, MARGIN)
-    return canvas, panel, cell, lambda x, y: (MARGIN + x * cell, MARGIN + side - y * cell)
+
+    def __init__(self, cells, panel_height):
+        """`cells` is how many there are along each axis."""
+        self.cell_side = max(2, GRID_SIDE // cells)  # whole pixels keep the lines sharp
+        self.side = self.cell_side * cells
+        width = self.side + PANEL + 3.5 * MARGIN
+        height = max(self.side, panel_height) + 2 * MARGIN
+        self.canvas = Canvas.blank(width, height)
+        self.panel = self.canvas.part(self.side + 2.5 * MARGIN, MARGIN)
+        grid = self.canvas.part(MARGIN, MARGIN)
+        grid.box(0, 0, self.side, self.side, WHITE)
+        for offset in range(0, self.side + 1, self.cell_side):
+            grid.box(offset - 0.5, 0, 1, self.side, LINE)
+            grid.box(0, offset - 0.5, self.side, 1, LINE)
+
+    def locate(self, point):
+        """Where a point of the grid is in the picture. It is given in cells from the lower left corner, y upwards."""
+        x, y = point
+        return MARGIN + x * self.cell_side, MARGIN + self.side - y * self.cell_side
 
 
 # ---- Box Pushing ----------------------------------------------------------------------------------------------------
 def draw_box_pushing(env, index):
-    """Picture, uint8 [height, width, 3], of one environment of a `BoxPushing` batch."""
-    canvas, panel, cell, pixel = _board(env.grid, HEADER + 2 * ROW + 140)
-    canvas.box(*pixel(0, env.goal_y + 0.5), cell * env.grid, cell, GREEN_PALE, LINE)
-    for waypoint in env.waypoints:
-        canvas.disc(*pixel(*waypoint), max(3, cell * 0.14), None, MUTED, 1.5)
-    box_y, together = env.box_y[index], bool(env.pushing_big[index])
-    for number in range(2):
-        _crate(canvas, *pixel(env.cell_x[number], box_y[number]), cell, str(number))
-    _crate(canvas, *pixel(env.cell_x[2:].mean(), box_y[2]), cell, "LR", together)
+    """A picture, uint8 [height, width, 3], of one environment of a `BoxPushing` batch."""
+    board = Board(env.grid, HEADER + 2 * ENTRY + 140)
+    both_push = env.pushing_big[index]
+    _goal_row_and_waypoints(board, env)
+    _boxes(board, env, index, both_push)
+    _pushers(board, env, index)
 
-    radius = max(9, cell * 0.29)
-    for agent, (x, y) in enumerate(_spread([pixel(*position) for position in env.position[index]], 1.5 * radius)):
-        heading = ((0, -1), (1, 0), (0, 1), (-1, 0))[env.orientation[index, agent]]
-        _agent(canvas, x, y, radius, agent, heading)
-
+    names = ["small box 0", "small box 1", "big box, left", "big box, right"]
+    notes = []
+    for waypoint in env.last_waypoint[index]:
+        name = "none yet" if waypoint < 0 else names[waypoint]
+        notes.append(f"last waypoint: {name}")
+    panel = board.panel
     _header(panel, env, index, "Box Pushing", f"grid: {env.grid} x {env.grid}")
-    last = ("small box 0", "small box 1", "big box, left", "big box, right", "none yet")
-    notes = [f"last waypoint: {last[waypoint]}" for waypoint in env.last_waypoint[index]]
-    _agents(panel.at(0, HEADER), env, index, range(2), notes)
-    legend = panel.at(0, HEADER + 2 * ROW + 30)
-    lines = ("small boxes", "big box, pushed by both" if together else "big box", "waypoints", "goal row")
-    for row, words in enumerate(lines):
-        legend.text(66, 30 * row, words)
-    _crate(legend, 13, 0, 26, "0")
-    _crate(legend, 39, 0, 26, "1")
-    _crate(legend, 26, 30, 26, "LR", together)
-    legend.disc(26, 60, 6, None, MUTED, 1.5)
-    legend.box(2, 80, 48, 20, GREEN_PALE, LINE)
-    return canvas.pixels()
+    _agent_list(panel.part(0, HEADER), env, index, range(2), notes)
+    _legend(panel.part(0, HEADER + 2 * ENTRY + 30), both_push)
+    return board.canvas.pixels()
 
 
-def _crate(canvas, x, y, size, labels, lit=False):
-    """A box around (x, y), with a label for each of its cells; size: that of a cell."""
-    wide, high, line = size * (len(labels) - 0.14), size * 0.86, max(1, size / 18)
-    canvas.box(x - wide / 2, y - high / 2, wide, high, YELLOW if lit else WOOD, WOOD_DARK, line, size / 12)
+def _goal_row_and_waypoints(board, env):
+    """Draws what stays the same."""
+    left, top = board.locate((0, env.goal_y + 0.5))
+    board.canvas.box(left, top, board.side, board.cell_side, GREEN_PALE, LINE)
+    radius = max(3, board.cell_side * 0.14)
+    for waypoint in env.waypoints:
+        x, y = board.locate(waypoint)
+        board.canvas.disc(x, y, radius, fill=None, outline=MUTED)
+
+
+def _boxes(board, env, index, both_push):
+    """Draws the two small boxes and the big one, which is lit while both agents push it."""
+    labels = ["0", "1", "LR"]
+    for number in range(3):
+        x, y = board.locate((env.box_x[number], env.box_y[index, number]))
+        is_big = number == 2
+        _crate(board.canvas, x, y, board.cell_side, labels[number], is_lit=is_big and both_push)
+
+
+def _pushers(board, env, index):
+    """Draws the agents, side by side if they are in the same cell."""
+    radius = max(9, board.cell_side * 0.29)
+    centres = [board.locate(position) for position in env.position[index]]
+    centres = _spread(centres, 1.5 * radius)
+    for agent, (x, y) in enumerate(centres):
+        orientation = env.orientation[index, agent]
+        _agent(board.canvas, x, y, radius, agent, HEADINGS[orientation])
+
+
+def _crate(canvas, x, y, cell_side, labels, is_lit=False):
+    """Draws a box around (x, y). It is as many cells wide as it has labels."""
+    count = len(labels)
+    width = cell_side * (count - 0.14)
+    height = cell_side * 0.86
+    left = x - width / 2
+    top = y - height / 2
+    colour = YELLOW if is_lit else WOOD
+    edge = max(1, cell_side / 18)
+    canvas.box(left, top, width, height, colour, WOOD_DARK, edge, radius=cell_side / 12)
     for number, label in enumerate(labels):
-        canvas.text(x + size * (number + 0.5 - len(labels) / 2), y, label, size * 0.38, anchor="m")
+        label_x = x + cell_side * (number + 0.5 - count / 2)
+        canvas.text(label_x, y, label, cell_side * 0.38, anchor="m")
+
+
+def _legend(panel, both_push):
+    """Explains what is in the grid."""
+    _crate(panel, 13, 0, 26, "0")
+    _crate(panel, 39, 0, 26, "1")
+    panel.text(66, 0, "small boxes")
+    _crate(panel, 26, 30, 26, "LR", both_push)
+    panel.text(66, 30, "big box, pushed by both" if both_push else "big box")
+    panel.disc(26, 60, 6, fill=None, outline=MUTED)
+    panel.text(66, 60, "waypoints")
+    panel.box(2, 80, 48, 20, GREEN_PALE, LINE)
+    panel.text(66, 90, "goal row")
 
 
 # ---- Warehouse Tool Delivery ----------------------------------------------------------------------------------------
 def draw_warehouse(env, index):
-    """Picture, uint8 [height, width, 3], of one environment of a `Warehouse` batch."""
-    points = np.vstack([env.waypoints.reshape(-1, 2), env.starts, env.arm])
-    low, high = np.minimum(points.min(0) - 0.5, 0), np.maximum(points.max(0) + 0.5, env.room_size)
-    scale = min(ROOM / (high - low)) / METRE
-    width, height = (high - low) * METRE
-    canvas = Canvas(ROOM[0] + 2 * MARGIN, height * scale + max(HEADER, ROW * env.n_agents) + 3.25 * MARGIN)
-    room = canvas.at(MARGIN + (ROOM[0] - width * scale) / 2, MARGIN, scale)
+    """A picture, uint8 [height, width, 3], of one environment of a `Warehouse` batch."""
+    plan = FloorPlan(env)
+    headings = []
+    notes = []
+    for robot in range(env.n_robots):
+        heading, note = _robot_note(env, index, robot)
+        headings.append(heading)
+        notes.append(note)
+    notes.append(f"steps left: {env.arm_left[index]}")
 
-    def place(point):
-        return (point[0] - low[0]) * METRE, (high[1] - point[1]) * METRE
+    _tool_room(plan, env)
+    _workshops(plan, env, index)
+    _waypoints(plan, env)
+    _arm_and_robots(plan, env, index, headings)
 
-    room.box(0, 0, width, height, WHITE, MUTED, 2, 6)
+    panel = plan.panel
+    labels = [*range(env.n_robots), ARM]
+    subtitle = f"robots: {env.n_robots}, humans: {env.n_humans}"
+    _header(panel, env, index, "Warehouse Tool Delivery", subtitle)
+    _agent_list(panel.part(310, 0), env, index, labels, notes)
+    _tools_to_find(panel.part(630, 0), env.copies - env.found[index])
+    return plan.canvas.pixels()
+
+
+class FloorPlan:
+    """A picture with an empty warehouse, as large as it fits, and with room for a panel below it.
+
+    Attributes:
+        canvas: the whole picture.
+        panel: the part of it below.
+        room: the warehouse, a canvas on which a metre is METRE long.
+        low, high: the warehouse's lower left and upper right corners (x, y) in metres.
+    """
+
+    def __init__(self, env):
+        points = np.vstack([env.waypoints.reshape(-1, 2), env.starts, env.arm])
+        lowest = points.min(axis=0)
+        highest = points.max(axis=0)
+        self.low = np.minimum(lowest - 0.5, 0)
+        self.high = np.maximum(highest + 0.5, env.room_size)
+        metres_wide, metres_deep = self.high - self.low
+        width = metres_wide * METRE
+        height = metres_deep * METRE
+        scale = min(ROOM_WIDTH / metres_wide, ROOM_HEIGHT / metres_deep) / METRE
+        panel_height = max(HEADER, ENTRY * env.n_agents)
+        total_height = height * scale + panel_height + 3.25 * MARGIN
+        self.canvas = Canvas.blank(ROOM_WIDTH + 2 * MARGIN, total_height)
+        self.panel = self.canvas.part(MARGIN, height * scale + 2 * MARGIN)
+        left = MARGIN + (ROOM_WIDTH - width * scale) / 2
+        self.room = self.canvas.part(left, MARGIN, scale)
+        _area(self.room, 0, 0, width, height, WHITE, MUTED, edge=2)
+
+    def locate(self, point):
+        """Where a point of the warehouse is in the room. It is given in metres, y upwards."""
+        x, y = point
+        return (x - self.low[0]) * METRE, (self.high[1] - y) * METRE
+
+
+def _area(canvas, x, y, width, height, fill, outline, edge=1.5):
+    """Draws a part of the warehouse with its upper left corner at (x, y)."""
+    canvas.box(x, y, width, height, fill, outline, edge, radius=6)
+
+
+def _tool_room(plan, env):
+    """Draws the tool room around the arm, the robots' places at its table and the waypoint of Go-TR."""
     inside = np.vstack([env.tables, env.arm, env.tool_room])
-    left, bottom = place((inside.min(0) - 0.65).clip(low + 0.1, high - 0.1))
-    right, top = place((inside.max(0) + 0.65).clip(low + 0.1, high - 0.1))
-    room.box(left, top, right - left, bottom - top, PAPER, LINE, 1.5, 6)
-    room.text(left + 12, bottom - 12, "Tool room", fill=MUTED)
-    for human in range(env.n_humans):
-        _workshop(room.at(*place(env.workshops[human])), env, index, human)
-    for x, y in {place(point) for point in env.waypoints.reshape(-1, 2)}:
-        room.disc(x, y, 7, WHITE, MUTED, 1.5)
-    robots = _spread([place(position) for position in env.position[index]], 37)
-    headings, notes = zip(*(_robot_note(env, index, robot) for robot in range(env.n_robots)), strict=True)
-    for robot, heading in enumerate(headings):
-        if heading:
-            goal = env.waypoints[robot, env.macro_action[index, robot]]
-            room.dashes(robots[robot], place(goal), _colours(robot)[0])
-    _arm(room.at(*place(env.arm)), env, index)
-    for robot, (x, y) in enumerate(robots):
-        _agent(room, x, y, 16, robot, headings[robot])
-        carried = env.carried[index, robot]
-        kinds = np.flatnonzero(carried)
-        pitch = min(19, 37 / max(len(kinds), 1))  # three kinds are as wide as the robot
-        for column, kind in enumerate(kinds):
-            tool_x = x + (column - (len(kinds) - 1) / 2) * pitch
-            _tool(room, tool_x, y - 27, pitch * 0.46, kind)
-            if carried[kind] > 1:
-                room.text(tool_x, y - 42, f"x{carried[kind]}", 11, anchor="m")
+    low = inside.min(axis=0) - 0.65
+    high = inside.max(axis=0) + 0.65
+    low = np.maximum(low, plan.low + 0.1)  # it ends before the walls of the warehouse
+    high = np.minimum(high, plan.high - 0.1)
+    left, bottom = plan.locate(low)
+    right, top = plan.locate(high)
+    _area(plan.room, left, top, right - left, bottom - top, PAPER, LINE)
+    plan.room.text(left + 12, bottom - 12, "Tool room", colour=MUTED)
 
-    panel = canvas.at(MARGIN, height * scale + 2 * MARGIN)
-    _header(panel, env, index, "Warehouse Tool Delivery", f"robots: {env.n_robots}, humans: {env.n_humans}")
-    notes += (f"steps left: {env.arm_left[index]}",)
-    _agents(panel.at(310, 0), env, index, [*range(env.n_robots), ARM], notes)
-    panel.text(630, 11, "tools still to be found", fill=MUTED)
-    for kind, count in enumerate(env.copies - env.found[index]):
-        _tool(panel, 642 + 76 * kind, 40, 12, kind, ghost=count == 0)
-        panel.text(662 + 76 * kind, 40, f"x {count}", fill=INK if count else MUTED)
-    return canvas.pixels()
+
+def _workshops(plan, env, index):
+    """Draws every workshop with its human."""
+    for human in range(env.n_humans):
+        x, y = plan.locate(env.workshops[human])
+        _workshop(plan.room.part(x, y), env, index, human)
+
+
+def _waypoints(plan, env):
+    """Draws the places to which the robots go."""
+    for waypoint in env.waypoints.reshape(-1, 2):
+        x, y = plan.locate(waypoint)
+        plan.room.disc(x, y, 7, WHITE, MUTED)
+
+
+def _arm_and_robots(plan, env, index, headings):
+    """Draws the ways that the robots have to go, and on top of them the arm and then the robots."""
+    room = plan.room
+    centres = [plan.locate(position) for position in env.position[index]]
+    centres = _spread(centres, 37)
+    for robot in range(env.n_robots):
+        if headings[robot] is not None:
+            action = env.macro_action[index, robot]
+            goal = plan.locate(env.waypoints[robot, action])
+            colour, _ = agent_colours(robot)
+            room.dashes(centres[robot], goal, colour)
+
+    arm_x, arm_y = plan.locate(env.arm)
+    _arm(room.part(arm_x, arm_y), env, index)
+    for robot, (x, y) in enumerate(centres):
+        _agent(room, x, y, 16, robot, headings[robot])
+        _carried_tools(room, x, y, env.carried[index, robot])
 
 
 def _robot_note(env, index, robot):
-    """The direction in which a robot moves, (dx, dy) or None, and in words how far it is or where."""
-    position, running = env.position[index, robot], not env.macro_done[index, robot]
-    to_go = env.waypoints[robot, env.macro_action[index, robot]] - position
-    distance, location, waited = hypot(*to_go), env.location[index, robot], env.waited[index, robot]
-    if running and distance > 0:
-        return (to_go[0] / distance, -to_go[1] / distance), f"{distance:.1f} m to go"
-    places = [*(f"at workshop {human}" for human in range(env.n_humans)), "in the tool room", "at the table"]
+    """The direction in which a robot moves, (dx, dy) or None, and words about how far it has to go or where it is."""
+    is_running = not env.macro_done[index, robot]
+    if is_running:
+        action = env.macro_action[index, robot]
+        way = env.waypoints[robot, action] - env.position[index, robot]
+        distance = hypot(*way)
+        if distance > 0:
+            east, north = way / distance
+            return (east, -north), f"{distance:.1f} m to go"
+
+    location = env.location[index, robot]
     if location == env.nowhere_yet or env.under_way[index, robot]:
         return None, "at no waypoint"
-    waits = places[location] == "at the table" and waited > 0 and (running or env.primitive)
-    return None, f"waits for a tool, {waited} of {env.tool_wait_steps}" if waits else places[location]
+    if location == env.tool_room_place:
+        return None, "in the tool room"
+    if location != env.table_place:
+        return None, f"at workshop {location}"
+    waited = env.waited[index, robot]
+    if waited > 0 and (is_running or env.primitive):
+        return None, f"waits for a tool, {waited} of {env.tool_wait_steps}"
+    return None, "at the table"
+
+
+def _carried_tools(room, x, y, counts):
+    """Draws above the robot at (x, y) each kind of tool that it carries, with a number if there are several."""
+    kinds = np.flatnonzero(counts)
+    columns = len(kinds)
+    pitch = min(19, 37 / max(columns, 1))  # three kinds are as wide as the robot
+    for column, kind in enumerate(kinds):
+        tool_x = x + (column - (columns - 1) / 2) * pitch
+        _tool(room, tool_x, y - 27, pitch * 0.46, kind)
+        if counts[kind] > 1:
+            room.text(tool_x, y - 42, f"x{counts[kind]}", 11, anchor="m")
+
+
+def _tool(canvas, x, y, radius, kind, is_ghost=False):
+    """Draws a tool: its number in its shape and colour. A ghost is a tool that is not there; it is pale."""
+    corners, relative_size, colour = TOOLS[kind]
+    if corners == 3:
+        y += 0.18 * radius  # a triangle's centre is below the middle of its height
+    reach = relative_size * radius
+    first_angle = pi / 4 if corners == 4 else -pi / 2  # a square stands on a side, the others have a corner at the top
+    shape = []
+    for corner in range(corners):
+        angle = first_angle + 2 * pi * corner / corners
+        dx = reach * cos(angle)
+        dy = reach * sin(angle)
+        shape.append((x + dx, y + dy))
+    fill = PAPER if is_ghost else colour
+    ink = MUTED if is_ghost else INK
+    canvas.polygon(shape, fill, ink, edge=radius / 10)
+    canvas.text(x, y, kind, radius * 1.05, ink, anchor="m", bold=not is_ghost)
 
 
 def _workshop(canvas, env, index, human):
-    """The room around its waypoint, the origin; its human works on the side away from the middle of the warehouse."""
-    phase, clock, has_tool = env.phase[index, human], env.clock[index, human], env.has_next_tool[index, human]
-    last = phase == 3
-    finished, late = last and clock <= 0, clock <= 0 and not has_tool
-    floor, strong, ink = (ALARM_PALE, ALARM, ALARM) if late else (PAPER, GREEN if finished else SLATE, INK)
-    above = env.workshops[human, 1] >= env.room_size[1] / 2
-    canvas.box(-88, -148 if above else -46, 176, 194, floor, ALARM if late else LINE, 1.5, 6)
-    desk = canvas.at(-76, -148 if above else 38)
-    desk.text(0, 18, f"W({human})", fill=MUTED)
-    for number in range(4):
-        colour = GREEN if number < phase or finished else strong if number == phase else LINE
-        desk.box(84 + 18 * number, 12, 14, 12, colour, radius=3)
-    desk.box(2, 55, 32, 26, strong, radius=13)
-    desk.disc(18, 47, 9, strong, floor, 1.5)
-    words = "finished" if finished else "last phase" if last else "has tool" if has_tool else "needs tool"
-    desk.text(50, 58, words, fill=ink)
-    if not last:
-        _tool(desk, 138, 57, 13, phase, ghost=not has_tool)
-    _bar(desk, 0, 89, 104, 8, 1 - clock / env.phase_lengths[human, phase], strong)
-    if not finished:
-        desk.text(152, 93, f"{-clock} late" if late else f"{clock} left", 12, ink, "r")
+    """Draws a workshop around its waypoint, the origin. It is red while its human is late."""
+    is_late = _is_late(env, index, human)
+    wall = ALARM if is_late else LINE
+    floor = ALARM_PALE if is_late else PAPER
+    is_north = env.workshops[human, 1] >= env.room_size[1] / 2
+    top = -148 if is_north else -46
+    desk_top = -148 if is_north else 38  # on the side away from the middle of the warehouse
+    _area(canvas, -88, top, 176, 194, floor, wall)
+    desk = canvas.part(-76, desk_top)
+    desk.text(0, 18, f"W({human})", colour=MUTED)
+    _human(desk, env, index, human, floor)
+
+
+def _is_late(env, index, human):
+    """Whether a human has to wait for its next tool."""
+    return env.clock[index, human] <= 0 and not env.has_next_tool[index, human]
+
+
+def _human(desk, env, index, human, floor):
+    """Draws a human, how far its work is, and the tool for its next phase. `floor` is the colour around it."""
+    phase = env.phase[index, human]
+    clock = env.clock[index, human]
+    has_tool = env.has_next_tool[index, human]
+    is_late = _is_late(env, index, human)
+    is_finished = phase == LAST_PHASE and clock <= 0
+    ink = ALARM if is_late else INK
+    colour = SLATE
+    if is_finished:
+        colour = GREEN
+    if is_late:
+        colour = ALARM
+
+    _phase_lights(desk, PHASES if is_finished else phase, colour)
+    desk.box(2, 55, 32, 26, colour, radius=13)  # the human's body
+    desk.disc(18, 47, 9, colour, floor)  # and head
+    desk.text(50, 58, _human_note(phase, is_finished, has_tool), colour=ink)
+    if phase < LAST_PHASE:
+        _tool(desk, 138, 57, 13, phase, is_ghost=not has_tool)
+    share = 1 - clock / env.phase_lengths[human, phase]
+    _bar(desk, 0, 89, 104, 8, share, colour)
+    if not is_finished:
+        countdown = f"{-clock} late" if is_late else f"{clock} left"
+        desk.text(152, 93, countdown, SMALL, ink, anchor="r")
+
+
+def _phase_lights(desk, done, colour):
+    """Draws a light for each phase. Those that are done are green, and the present one has the given colour."""
+    for phase in range(PHASES):
+        light = LINE
+        if phase < done:
+            light = GREEN
+        if phase == done:
+            light = colour
+        desk.box(84 + 18 * phase, 12, 14, 12, light, radius=3)
+
+
+def _human_note(phase, is_finished, has_tool):
+    """How far a human is, in words."""
+    if is_finished:
+        return "finished"
+    if phase == LAST_PHASE:
+        return "last phase"
+    return "has tool" if has_tool else "needs tool"
 
 
 def _arm(canvas, env, index):
-    """The arm at the origin: what it is doing and for how long, what its hand holds, and the staged tools."""
-    task, steps_left, staged = env.macro_action[index, -1], env.arm_left[index], env.staged[index]
-    passes, searches = steps_left > 0 and 1 <= task <= env.n_robots, steps_left > 0 and task > env.n_robots
-    ready = passes and env.pass_ready[index]
-    holds = ready and staged[0] >= 0
-    canvas.box(-40, -38, 168, 76, WOOD, WOOD_DARK, 1.5, 6)
-    if passes or searches:
-        hand = 0.6 * METRE * (env.tables[task - 1] - env.arm) * (1, -1) if passes else (-24, -22)
-        canvas.line([(0, 0), hand], SLATE, 7)
-        canvas.disc(*hand, 12, WHITE, SLATE if ready or searches else ALARM, 2)
-        if holds or searches:
-            _tool(canvas, *hand, 8, staged[0] if holds else task - env.n_robots - 1, ghost=searches)
+    """Draws the arm at the origin, its table with the staged tools, its hand, and what it is doing and for how long."""
+    action = env.macro_action[index, -1]
+    steps_left = env.arm_left[index]
+    staged = env.staged[index]
+    is_running = steps_left > 0
+    passes = is_running and 1 <= action <= env.n_robots
+    searches = is_running and action > env.n_robots
+    hands_over = passes and env.pass_ready[index]  # the robot was waiting when the Pass began
+    _area(canvas, -40, -38, 168, 76, WOOD, WOOD_DARK)
+    if passes:
+        robot = action - 1
+        east, north = env.tables[robot] - env.arm
+        # The hand is at six tenths of the way to the robot's place.
+        hand_x = 0.6 * METRE * east
+        hand_y = 0.6 * METRE * -north
+        if hands_over:
+            _hand(canvas, hand_x, hand_y, SLATE, staged[0])
+        else:
+            _hand(canvas, hand_x, hand_y, ALARM, NO_TOOL)
+    if searches:
+        tool = action - 1 - env.n_robots
+        _hand(canvas, -24, -22, SLATE, tool, is_ghost=True)
     _agent(canvas, 0, 0, 16, ARM)
+    _staged_tools(canvas, staged, hands_over)
+    words = "at rest"
+    share = 0.0
+    if is_running:
+        words = env.macro_action_names[-1][action]
+        share = 1 - steps_left / env.task_steps[action]
+    canvas.text(28, 13, words, SMALL)
+    _bar(canvas, 28, 24, 92, 6, share, SLATE)
+
+
+def _hand(canvas, x, y, colour, tool, is_ghost=False):
+    """Draws the arm from the origin to its hand at (x, y) and a tool in it."""
+    canvas.line((0, 0), (x, y), SLATE, thickness=7)
+    canvas.disc(x, y, 12, WHITE, colour, edge=2)
+    if tool != NO_TOOL:
+        _tool(canvas, x, y, 8, tool, is_ghost)
+
+
+def _staged_tools(canvas, staged, hands_over):
+    """Draws the places for staged tools and the tools in them. The first one is a ghost while the hand has it."""
     pitch = min(34, 96 / len(staged))
-    for place, tool in enumerate(staged):
-        x, size = 28 + (place + 0.44) * pitch, pitch * 0.88
-        canvas.box(x - size / 2, -14 - size / 2, size, size, WHITE, WOOD_DARK, 1, 3)
-        if tool >= 0:
-            _tool(canvas, x, -14, pitch * 0.32, tool, ghost=holds and place == 0)
-    duration = env.pass_steps if passes else env.search_steps if searches else env.arm_wait_steps
-    canvas.text(28, 13, env.macro_action_names[-1][task] if steps_left > 0 else "at rest", 12)
-    _bar(canvas, 28, 24, 92, 6, 1 - steps_left / duration if steps_left > 0 else 0, SLATE)
+    side = pitch * 0.88
+    for number, tool in enumerate(staged):
+        x = 28 + (number + 0.44) * pitch
+        left = x - side / 2
+        top = -14 - side / 2
+        canvas.box(left, top, side, side, WHITE, WOOD_DARK, radius=3)
+        if tool != NO_TOOL:
+            in_hand = hands_over and number == 0
+            _tool(canvas, x, -14, pitch * 0.32, tool, is_ghost=in_hand)
+
+
+def _tools_to_find(panel, counts):
+    """Says how many copies of each tool the arm has not found yet."""
+    panel.text(0, 11, "tools still to be found", colour=MUTED)
+    for kind, count in enumerate(counts):
+        column = panel.part(76 * kind, 0)
+        ink = INK if count else MUTED
+        _tool(column, 12, 40, 12, kind, is_ghost=count == 0)
+        column.text(32, 40, f"x {count}", colour=ink)
 
 
 # ---- Capture Target -------------------------------------------------------------------------------------------------
 def draw_capture_target(env, index):
-    """Picture, uint8 [height, width, 3], of one environment of a `CaptureTarget` batch."""
-    canvas, panel, cell, pixel = _board(env.grid, HEADER + 40 + ROW * env.n_agents)
-    position, target = env.position[index], env.target[index]
-    corners = [pixel(*corner) for corner in ((0, 0), (env.grid, 0), (env.grid, env.grid), (0, env.grid))]
-    for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
-        canvas.dashes(start, end, MUTED)  # an open border: the world wraps around
+    """A picture, uint8 [height, width, 3], of one environment of a `CaptureTarget` batch."""
+    board = Board(env.grid, HEADER + 40 + ENTRY * env.n_agents)
+    position = env.position[index]
+    target = env.target[index]
+    _open_border(board, env.grid)
+    _target(board, target)
+    for cell in np.unique(position, axis=0):
+        stands_here = (position == cell).all(axis=1)
+        _crowd(board, cell, np.flatnonzero(stands_here))
 
-    x, y = pixel(*(target + 0.5))
-    canvas.box(x - cell / 2, y - cell / 2, cell, cell, ALARM_PALE)
-    _cross(canvas, x, y, cell * 0.56)  # its ends are seen however many agents stand on it
-    for place in np.unique(position, axis=0):
-        here = np.flatnonzero((position == place).all(1))
-        columns = ceil(sqrt(len(here)))
-        rows, pitch = ceil(len(here) / columns), max(cell, 26) / max(columns, 1.6)
-        x, y = pixel(*(place + 0.5))
-        for number, agent in enumerate(here):
-            across, down = number % columns - (columns - 1) / 2, number // columns - (rows - 1) / 2
-            _agent(canvas, x + across * pitch, y + down * pitch, pitch * 0.47, agent)
-
-    _header(panel, env, index, "Capture Target", f"agents: {env.n_agents}, torus: {env.grid} x {env.grid}")
-    count, arrived = panel.at(0, HEADER), int((position == target).all(1).sum())
-    _cross(count, 8, 6, 7)
-    count.text(24, 6, "on the target", fill=MUTED)
-    count.text(PANEL, 6, f"{arrived} / {env.n_agents}", anchor="r")
-    _bar(count, 0, 18, PANEL, 6, arrived / env.n_agents, ALARM)
     notes = []
-    for sees, (goal_x, goal_y) in zip(env.visible[index], env.goal[index], strict=True):
-        goal = f", heads for {goal_x}, {goal_y}" if goal_x >= 0 else ""
-        notes.append(("sees the target" if sees else "target hidden") + goal)
-    _agents(count.at(0, 36), env, index, range(env.n_agents), notes)
-    return canvas.pixels()
+    for agent in range(env.n_agents):
+        note = "sees the target" if env.visible[index, agent] else "target hidden"
+        goal_x, goal_y = env.goal[index, agent]
+        if goal_x >= 0:
+            note += f", heads for {goal_x}, {goal_y}"
+        notes.append(note)
+    panel = board.panel
+    subtitle = f"agents: {env.n_agents}, torus: {env.grid} x {env.grid}"
+    on_target = (position == target).all(axis=1)
+    arrivals = panel.part(0, HEADER)
+    _header(panel, env, index, "Capture Target", subtitle)
+    _arrivals(arrivals, np.count_nonzero(on_target), env.n_agents)
+    _agent_list(arrivals.part(0, 36), env, index, range(env.n_agents), notes)
+    return board.canvas.pixels()
+
+
+def _open_border(board, cells):
+    """Draws the border dashed, because the world wraps around there."""
+    lower_left = board.locate((0, 0))
+    lower_right = board.locate((cells, 0))
+    upper_right = board.locate((cells, cells))
+    upper_left = board.locate((0, cells))
+    board.canvas.dashes(lower_left, lower_right, MUTED)
+    board.canvas.dashes(lower_right, upper_right, MUTED)
+    board.canvas.dashes(upper_right, upper_left, MUTED)
+    board.canvas.dashes(upper_left, lower_left, MUTED)
+
+
+def _target(board, target):
+    """Draws a red cross on the target's cell, so large that it is seen however many agents stand on it."""
+    side = board.cell_side
+    x, y = board.locate(target + 0.5)
+    board.canvas.box(x - side / 2, y - side / 2, side, side, ALARM_PALE)
+    _cross(board.canvas, x, y, side * 0.56)
+
+
+def _cross(canvas, x, y, radius):
+    """Draws a red cross around (x, y)."""
+    left = x - radius
+    right = x + radius
+    top = y - radius
+    bottom = y + radius
+    canvas.line((left, bottom), (right, top), ALARM, radius / 3)
+    canvas.line((left, top), (right, bottom), ALARM, radius / 3)
+
+
+def _crowd(board, cell, agents):
+    """Draws the agents that stand on one cell, in rows and columns."""
+    x, y = board.locate(cell + 0.5)
+    columns = ceil(sqrt(len(agents)))
+    rows = ceil(len(agents) / columns)
+    pitch = max(board.cell_side, 26) / max(columns, 1.6)
+    for number, agent in enumerate(agents):
+        row, column = divmod(number, columns)
+        agent_x = x + (column - (columns - 1) / 2) * pitch
+        agent_y = y + (row - (rows - 1) / 2) * pitch
+        _agent(board.canvas, agent_x, agent_y, pitch * 0.47, agent)
+
+
+def _arrivals(panel, count, agents):
+    """Says how many of the agents stand on the target."""
+    _cross(panel, 8, 6, 7)
+    panel.text(24, 6, "on the target", colour=MUTED)
+    panel.text(PANEL, 6, f"{count} / {agents}", anchor="r")
+    _bar(panel, 0, 18, PANEL, 6, count / agents, ALARM)

@@ -130,7 +130,7 @@ def test_gradients_stay_with_their_networks():
 
     logits, values = logits_at_rows(learner["agents"], batch), learner["critics"](batch)
     policy = soft_policy(logits, batch["available"], 0.1)
-    (logits.sum() + values.sum()).backward(retain_graph=True)
+    (logits.sum() + values.sum()).backward(retain_graph=True)  # from here on all have gradients, perhaps zeros
     _, actor, critic, _ = actor_critic_loss(policy, values, values.detach() + 1, batch, 0.0)
     assert all(moved.all() for moved in gradients(actor, "agents"))
     assert not any(moved.any() for moved in gradients(actor, "critics"))

@@ -181,10 +181,12 @@ def test_every_array_of_the_simulator_is_among_those_tested():
 def test_agents_on_one_spot_are_all_visible(env_id):
     env = started(env_id)
     env.position[:] = env.position[:, :1]
-    apart = {agent: pixels_of(picture(env), rendering._colours(agent)[0]) for agent in range(env.position.shape[1])}
+    apart = {
+        agent: pixels_of(picture(env), rendering.agent_colours(agent)[0]) for agent in range(env.position.shape[1])
+    }
     env.position[:] += 1000  # far outside: what is left of each colour is that of the panel and the scenery
     for agent, count in apart.items():
-        assert count > pixels_of(picture(env), rendering._colours(agent)[0]) + 20
+        assert count > pixels_of(picture(env), rendering.agent_colours(agent)[0]) + 20
 
 
 def test_points_are_pushed_apart_and_left_alone_where_there_is_room():

@@ -195,8 +195,9 @@ def test_a_program_that_is_stopped(tmp_path, monkeypatch, number):
     printed, errors = process.communicate(timeout=60)
     (folder,) = tmp_path.iterdir()
     said = [line for line in errors.splitlines() if not line.startswith("step ")]  # but for evaluations
+    assert printed == f"{folder}\n", "it is shown at once"
     if number == signal.SIGINT:
-        assert process.returncode == 130 and printed == f"{folder}\n"
+        assert process.returncode == 130
         assert said == ["stopped; --resume with the run's folder goes on from its last checkpoint"]
     else:
         assert process.returncode == -signal.SIGTERM and not said

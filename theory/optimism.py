@@ -114,12 +114,16 @@ def learned(script, args):
     pushes = batch["valid"] & batch["free"][..., 0] & (action[..., 0] == PUSH)  # [B, T]
     with torch.no_grad():
         utilities = script.utilities_at_rows(learner["agents"], batch)  # [B, T, n, A]
-        others = utilities[..., 0, :].clone()
-        others[..., PUSH] = -torch.inf
-        other_action = torch.stack([others.argmax(2), action[..., 1]], 2)
+        other_action = torch.stack([best_other(utilities[..., 0, :]), action[..., 1]], 2)
         push = joint_values(script, args, learner, utilities, action, batch)
         other = joint_values(script, args, learner, utilities, other_action, batch)
     return push[pushes].mean().item(), other[pushes].mean().item()
+
+
+def best_other(utilities):
+    """The best macro-action that is not a push, from float32 [..., A]."""
+    is_push = torch.arange(utilities.shape[-1]) == PUSH
+    return utilities.masked_fill(is_push, -torch.inf).argmax(-1)
 
 
 def joint_values(script, args, learner, utilities, actions, batch):

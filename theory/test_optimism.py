@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from envs.box_pushing import PUSH
 from tests.rollouts import TINY, args_for
 from theory import optimism
 
@@ -39,6 +41,13 @@ def test_the_value_is_a_balance_and_crosses_at_the_bound():
         assert (e > safe) == (beta < highest)
         after_failing = gamma * max(e, safe) - fails
         assert p * (big - e) == pytest.approx(beta**2 * (1 - p) * (e - after_failing))
+
+
+def test_the_best_other_macro_action_is_no_push():
+    utilities = torch.arange(8.0).expand(2, 8).clone()
+    utilities[0, PUSH] = 9.0
+    utilities[1, 2] = 8.0
+    assert optimism.best_other(utilities).tolist() == [7, 2]
 
 
 @pytest.mark.parametrize("script", optimism.SCRIPTS, ids=lambda script: script.__name__)
