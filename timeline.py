@@ -20,19 +20,26 @@ from envs.rendering import ALARM, ARM, GREEN_DARK, INK, MUTED, WHITE, agent_colo
 WIDTH = 800  # of the figure
 LEFT = 80  # from the left edge of the figure to the strips
 RIGHT = 66  # from the strips to its right edge
-MARGIN = 17  # from its left edge to the lines above and below the strips
+MARGIN = 17  # from its left edge to the text above and below the strips
 FOOT = 18  # from the last strip to its lower edge
 ROWS = 10  # from the top of a strip to the numbers of its rows
 LANES = 30  # from the top of a strip to the bars of the first agent
 TIME = 88  # from the top of a strip to its axis of time, without the lanes
 STRIP = 122  # height of a strip without its lanes
+LANE = 30  # height of an agent's lane: a bar and the names below it
+LANE_WITH_UTILITIES = 57  # height of a lane with room for three utilities, too
 SMALL = 7  # sizes of text
 LARGE = 8.5
-LETTER = 0.63 * SMALL  # room for a small letter in MONO, where all letters are equally wide
+
+# Matplotlib's options for text whose letters are equally wide, for the box around a tag, and for the dot where an agent
+# chooses. LETTER is the width of a small letter of that text.
 MONO = {"family": "monospace", "bbox": {"facecolor": WHITE, "edgecolor": "none", "pad": 1}}
+LETTER = 0.63 * SMALL
 TAG = {"boxstyle": "round,pad=0.15,rounding_size=0.5", "facecolor": WHITE}
 DOT = {"marker": "o", "markersize": 7, "color": INK, "markeredgecolor": WHITE, "clip_on": False, "zorder": 3}
-RULE = "#aab5bf"
+RULE = "#aab5bf"  # colour of the lines at rows
+
+ONGOING = "m⁻"  # the paper's sign for a macro-action that goes on while others are chosen
 WORDS = "Asynchronous: macro-actions end at different times, so at a row some agents choose and the others go on."
 LEGEND = [
     "▬ macro-action · its steps (6, 1: twice in a row)",
@@ -47,23 +54,23 @@ def draw(episode, title, facts, steps=None):
     steps: (first, last) for the part between two times, enlarged and with utilities; None for the whole episode.
     """
     first, last = steps or (0, len(episode.rewards))
-    most = 12 if steps else 45  # steps in a strip
-    count = ceil((last - first) / most)
-    length = ceil((last - first) / count)
-    example = example_row(episode, first, min(first + length, last))
+    most_steps = 12 if steps else 45  # in a strip
+    count = ceil((last - first) / most_steps)  # of strips
+    length = ceil((last - first) / count)  # of a strip in steps
+    first_end = min(first + length, last)  # of the first strip, which contains the example row
+    example = example_row(episode, first, first_end)
     utilities = episode.utilities if steps else None
-    lane = 30  # height for a bar and its name
+    lane = LANE if utilities is None else LANE_WITH_UTILITIES
     lines = [facts, WORDS, *LEGEND]
     if utilities is not None:
-        lane = 57  # and for three utilities
         lines.append(f"0.50 {episode.meaning}, highest first, 3 at most")
-    lines += ["", *describe(episode, example, min(first + length, last))]
-    head = 40 + 14 * len(lines)
+    lines += ["", *describe(episode, example, first_end)]
+    head = 40 + 14 * len(lines)  # from the upper edge of the figure to the strips
     strip_height = STRIP + lane * len(episode.labels)
     height = head + strip_height * count + FOOT
 
     figure = Figure((WIDTH / 72, height / 72), dpi=180)
-    page = figure.add_axes((0, 0, 1, 1))
+    page = figure.add_axes((0, 0, 1, 1))  # for the text above and below the strips
     page.set(xlim=(0, WIDTH), ylim=(height, 0))
     page.set_axis_off()
     write(page, MARGIN, 22, title, size=15, weight="bold")
@@ -71,12 +78,12 @@ def draw(episode, title, facts, steps=None):
         write(page, MARGIN, 42 + 14 * number, line, size=LARGE)
     page.hlines(head, MARGIN, WIDTH - MARGIN, INK, linewidth=1)
 
-    grid = figure.subplots(count, squeeze=False)[:, 0]
+    column = figure.subplots(count, squeeze=False)[:, 0]  # the axes of the strips, from the top down
     figure.subplots_adjust(left=LEFT / WIDTH, right=1 - RIGHT / WIDTH, hspace=0)
     figure.subplots_adjust(top=1 - head / height, bottom=FOOT / height)
     pitch = (WIDTH - LEFT - RIGHT) / length
     shortened = set()
-    for axes, start in zip(grid, range(first, last, length), strict=True):
+    for axes, start in zip(column, range(first, last, length), strict=True):
         end = min(start + length, last)
         axes.set(xlim=(start, start + length), ylim=(strip_height, 0), facecolor="none")
         strip = Strip(axes, episode, start, end, pitch, lane, utilities, shortened)
@@ -103,7 +110,8 @@ def save(figure, path, kind):
 def example_row(episode, first, last):
     """The time of the row between two times that shows best what ongoing means, or None if nobody is ongoing at any.
 
-    Two ongoing agents show it better than one. Three steps between the row and its neighbours leave room for marks.
+    Two ongoing agents show it better than one. Among equals, a row that is three steps from its neighbours or more has
+    the most room for marks.
     """
     rows = episode.rows()
 
@@ -117,7 +125,7 @@ def example_row(episode, first, last):
 
 
 def describe(episode, row, last):
-    """Lines about the example row; if there is none, they say that all agents choose at every row until `last`."""
+    """Lines about the example row. If there is none, they say that all agents choose at every row until `last`."""
     if row is None:
         return [f"Up to t = {last} all agents choose at every row: nobody is ongoing."]
     chosen = []
@@ -126,8 +134,9 @@ def describe(episode, row, last):
         name = episode.names[agent][episode.running[row, agent]]
         group = chosen if episode.chosen[row, agent] else ongoing
         group.append(f"agent {label} {name}")
-    words = "m⁻ running macro-actions of the ongoing agents, which have no dot:"
-    lines = [f"row {episode.rows().index(row)}, t = {row}"]
+    words = f"{ONGOING} running macro-actions of the ongoing agents, which have no dot:"
+    number = episode.rows().index(row)
+    lines = [f"row {number}, t = {row}"]
     lines += fold(f"● chosen now: {', '.join(chosen)}")
     lines += fold(f"{words} {', '.join(ongoing)}")
     return lines
@@ -152,12 +161,12 @@ def explain(labels, names):
 
 
 def fold(words):
-    """The words in lines that are not wider than the figure."""
+    """The words as a list of lines that are not wider than the figure."""
     return wrap(words, 140, break_on_hyphens=False)
 
 
 def write(axes, x, y, words, **options):
-    """Puts text at (x, y), where y is the middle of its height."""
+    """Writes words at (x, y), where y is the middle of their height. The options are those of matplotlib's text."""
     style = {"size": SMALL, "color": INK, "va": "center", **options}
     axes.text(x, y, words, **style)
 
@@ -172,8 +181,8 @@ class Strip:
     first: int
     last: int
     pitch: float  # width of a step
-    lane: int  # height of a lane
-    utilities: np.ndarray | None  # those of the episode, if they are shown
+    lane: int  # height of an agent's lane
+    utilities: np.ndarray | None  # those of the episode, or None if they are not shown
     shortened: set  # receives the names that are abbreviated
 
     def draw(self):
@@ -186,7 +195,7 @@ class Strip:
         self.draw_time()
 
     def middle(self, agent):
-        """How far an agent's bars are from the top."""
+        """How far the middle of an agent's bars is from the top."""
         return LANES + self.lane * agent
 
     def bottom(self):
@@ -208,13 +217,13 @@ class Strip:
             write(self.axes, self.last, ROWS, "end", color=MUTED)
 
     def mark(self, row):
-        """Marks the example row with a line up to its description, and the ongoing agents with a tag."""
+        """Draws a line from the example row up to its description, and a tag on the bar of each ongoing agent."""
         self.axes.vlines(row, 0, self.bottom(), INK, linewidth=1.6)
         for agent in np.flatnonzero(~self.episode.chosen[row]):
-            write(self.axes, row, self.middle(agent), "m⁻", ha="center", weight="bold", bbox=TAG)
+            write(self.axes, row, self.middle(agent), ONGOING, ha="center", weight="bold", bbox=TAG)
 
     def draw_lane(self, agent):
-        """Draws an agent's bars, dots where it chooses, and names below the bars."""
+        """Draws an agent's bars, dots where it chooses, and below the bars their names and the utilities."""
         label = self.episode.labels[agent]
         names = self.episode.names[agent]
         color, _ = agent_colours(label)
@@ -231,7 +240,7 @@ class Strip:
             self.write_names(names[action], list(group), y + 12)
 
     def write_names(self, name, bars, y):
-        """Writes the name of bars that follow each other below each, or once if one of them is too short for it."""
+        """Writes the name that successive bars have in common: below each of them if there is room, otherwise once."""
         shortest = min(bar.end - bar.start for bar in bars)
         if len(name) <= self.letters(shortest):
             for bar in bars:
@@ -240,7 +249,7 @@ class Strip:
             self.write_name(name, bars, y)
 
     def write_name(self, name, bars, y):
-        """Writes a name below bars that follow each other, with the steps of each or with their number."""
+        """Writes a name once below successive bars, with the steps of each or, for want of room, how many bars."""
         start = max(bars[0].start, self.first)
         end = min(bars[-1].end, self.last)
         steps = ", ".join(str(bar.end - bar.start) for bar in bars)
@@ -259,24 +268,27 @@ class Strip:
         could_start = [action for action in order if utilities[action] > -np.inf]
         for line, action in enumerate(could_start[:3]):
             name = names[action]
-            value = f"{utilities[action]:z.2f}"
+            value = f"{utilities[action]:z.2f}"  # z: 0.00, never -0.00
             candidates = [f"{value} {name}", f"{value} {shorten(name)}", value]
             words = self.fit(name, candidates, room)
             write(self.axes, bar.start, y + 9 * line, words, color=MUTED, **MONO)
 
     def letters(self, steps):
-        """How many letters are as wide as some steps, with a little space after them."""
+        """How many letters fit in the width of some steps and leave a little space, a float."""
         return steps * self.pitch / LETTER - 0.5
 
     def fit(self, name, candidates, steps):
-        """The first of the candidates that is not wider than some steps, or ""; notes a name that it abbreviates."""
+        """The first of the candidates that is not wider than some steps, or "" if there is none.
+
+        If it abbreviates the name, the name is added to `shortened`.
+        """
         words = next((words for words in candidates if len(words) <= self.letters(steps)), "")
         if shorten(name) in words and name not in words:
             self.shortened.add(name)
         return words
 
     def draw_rewards(self):
-        """Draws a mark for each reward, with a number unless it is the usual one or there is no room."""
+        """Draws a mark for each reward. Where there is room, one that is neither 0 nor the usual one has a number."""
         rewards = self.episode.rewards
         values, counts = np.unique(rewards, return_counts=True)
         usual = values[counts.argmax()]
@@ -287,7 +299,7 @@ class Strip:
         free = self.first  # the time from which on there is room
         for step in range(self.first, self.last):
             reward = rewards[step]
-            side = -np.sign(reward)  # above the line or below it
+            side = -np.sign(reward)  # -1 draws above the line, 1 below it
             color = GREEN_DARK if reward > 0 else ALARM
             tip = y + side * (2 + 10 * abs(reward) / largest)
             self.axes.vlines(step + 0.5, y, tip, color, linewidth=2.5)

@@ -521,9 +521,10 @@ def test_training_stores_what_was_played(tmp_path, monkeypatch, script):
     recorder = Recorder(monkeypatch, script)
     acted = Spy(monkeypatch, script, "act")
     options = dict(total_timesteps=680, learning_starts=600, reward_scale=10.0, gamma=0.9, eval_frequency=800)
-    script.train(args_for(script, "wtd-s", runs_dir=str(tmp_path), **{**TINY, **options}))
+    script.train(args_for(script, "bp-10", runs_dir=str(tmp_path), **{**TINY, **options}))
     ended = recorder.episodes()
     assert 1 < len(ended) < 50 and len(recorder.buffers[0].ended) == len(ended)
+    assert {episode.terminated for episode in ended} == {True, False}
     for stored, episode in zip(recorder.buffers[0].ended, ended, strict=True):
         check_rows(stored, expected_rows(episode, 0.9, reward_scale=10.0))
     exploring = [call for call in acted.calls if call.rng is not None]
@@ -533,7 +534,8 @@ def test_training_stores_what_was_played(tmp_path, monkeypatch, script):
         fresh = (call.infos["macro_action"] < 0).all(1)
         restarts += fresh.sum()
         assert not call.hidden[:, fresh].any() and call.hidden[:, ~fresh].abs().sum((0, 2)).bool().all()
-    assert restarts == 4 + len(ended) - sum(over.sum() for over in [recorder.log[-1][7] | recorder.log[-1][8]])
+    *_, terminations, truncations, _ = recorder.log[-1]
+    assert restarts == 4 + len(ended) - (terminations | truncations).sum()
 
 
 def smoke(folder, monkeypatch, script, env_id, **options):

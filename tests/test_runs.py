@@ -25,7 +25,7 @@ from tests.short_runs import CHARTS, EVAL, REPLAY, SHORT, cut_episodes, short
 from tests.sync import ROOT, SCRIPTS
 
 TINY = {**SHORT, **REPLAY}
-TASKS = dict(zip(SCRIPTS, ("ct-10", "bp-10", "wtd-s", "wtd-s", "ct-10", "bp-10"), strict=True))  # one for each script
+TASKS = dict(zip(SCRIPTS, ("ct-10", "bp-10", "wtd-s", "bp-10", "ct-10", "wtd-s"), strict=True))  # one for each script
 
 
 def flags(options):
@@ -158,7 +158,7 @@ def test_interrupted_and_resumed_equals_undisturbed(tmp_path, monkeypatch, scrip
     """
     module = importlib.import_module(script)
     cut_episodes(monkeypatch, 17)
-    options = dict(seed=0, exploration_timesteps=200, total_timesteps=700, eval_frequency=200)
+    options = dict(seed=0, exploration_timesteps=200, total_timesteps=700, eval_frequency=200, batch_size=13)
     undisturbed = module.train(short(module, TASKS[script], tmp_path / "whole", **options))
     args = short(module, TASKS[script], tmp_path / "cut", checkpoint_frequency=50.0, **options)
     seconds = iter(range(10_000))
@@ -167,9 +167,10 @@ def test_interrupted_and_resumed_equals_undisturbed(tmp_path, monkeypatch, scrip
         patch.setattr(module, "time", clock)
         folder = interrupted(patch, module, args, steps=130)
     assert reached(folder) == 412
+    saved = module.load(folder / "checkpoint.pt")
+    assert saved["hidden"].any() and any(map(len, saved["buffer"]["running"])) and saved["buffer"]["ended"]
     stale = scalars(folder)
     assert stale["charts/episodic_return"][-1][0] > 412, "what was logged after the checkpoint is dropped below"
-    remembered = module.load(folder / "checkpoint.pt")["hidden"]
     acted = []
     act = module.act
 
@@ -180,7 +181,7 @@ def test_interrupted_and_resumed_equals_undisturbed(tmp_path, monkeypatch, scrip
     with monkeypatch.context() as patch:
         patch.setattr(module, "act", noted)
         resume(module, folder)
-    assert remembered.any() and torch.equal(acted[0], remembered)
+    assert torch.equal(acted[0], saved["hidden"])
     assert_same_run(undisturbed, folder)
 
 
@@ -242,26 +243,36 @@ def test_a_checkpoint_holds_the_rows_that_were_written_alone(tmp_path, monkeypat
 
 
 def test_a_kill_costs_at_most_a_minute(tmp_path, monkeypatch):
-    """By default a checkpoint is written every minute, here by a clock that moves on by 7 s in each step."""
+    """By default a checkpoint is written every minute, here by a clock that moves on by 7 s in each step.
+
+    What was logged up to a checkpoint is written before it.
+    """
     assert all(importlib.import_module(script).Args.checkpoint_frequency == 60 for script in SCRIPTS)
     seconds = [0.0]
-    saved_at = []
-    act, save = avf_qplex.act, avf_qplex.save
+    written = []
+    act, save, flush = avf_qplex.act, avf_qplex.save, avf_qplex.SummaryWriter.flush
 
     def slow_act(*args):
         seconds[0] += 7.0 * (len(args) > 4)  # a step of training, not of evaluation
         return act(*args)
 
     def spy_save(path, *args, **content):
-        saved_at.extend([seconds[0]] * (path.name == "checkpoint.pt"))
+        written.append((seconds[0], path.name))
         save(path, *args, **content)
+
+    def spy_flush(self):
+        written.append((seconds[0], "log"))
+        flush(self)
 
     clock = types.SimpleNamespace(monotonic=lambda: seconds[0], time_ns=time.time_ns)
     monkeypatch.setattr(avf_qplex, "time", clock)
     monkeypatch.setattr(avf_qplex, "act", slow_act)
     monkeypatch.setattr(avf_qplex, "save", spy_save)
+    monkeypatch.setattr(avf_qplex.SummaryWriter, "flush", spy_flush)
     train(short(avf_qplex, "bp-10", tmp_path, total_timesteps=200))
-    assert saved_at == [7.0 + 63.0 * number for number in range(6)], "over 60 s is after nine steps"
+    times = [7.0 + 63.0 * number for number in range(6)]  # 63 s are the first nine steps that take over 60 s
+    assert written[:12] == [(time, name) for time in times for name in ("log", "checkpoint.pt")]
+    assert "checkpoint.pt" not in dict(written[12:]).values()
 
 
 # ---- what a run leaves ----------------------------------------------------------------------------------------------
