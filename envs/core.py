@@ -234,15 +234,16 @@ class MacroVectorEnv(VectorEnv, ABC):
     def _update_available(self):
         """Sets `available`: for a free agent its initiation set, for a busy one only its running macro-action."""
         can_start = self._can_start() & self.own_actions
-        is_empty = self.macro_done & ~can_start.any(axis=2)  # [N, n]
-        is_stuck = is_empty & ~self.over[:, None]
-        if is_stuck.any():
-            env, agent = np.argwhere(is_stuck)[0]
-            raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
-        # Nobody chooses in an episode that is over. An empty set is filled there, so that whoever masks with it can.
-        can_start = np.where(is_empty[:, :, None], self.own_actions, can_start)
         is_running = self.macro_action[:, :, None] == np.arange(self.own_actions.shape[1])  # [N, n, A]
         self.available = np.where(self.macro_done[:, :, None], can_start, is_running)
+        is_empty = ~self.available.any(axis=2)  # [N, n]
+        if is_empty.any():
+            is_stuck = is_empty & ~self.over[:, None]
+            if is_stuck.any():
+                env, agent = np.argwhere(is_stuck)[0]
+                raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
+            # Nobody chooses in an episode that is over. An empty set is filled there, so that whoever masks with it can.
+            self.available |= is_empty[:, :, None] & self.own_actions
 
     def _infos(self):
         return {

@@ -12,6 +12,7 @@ import ast
 import difflib
 import re
 import sys
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -163,6 +164,7 @@ def scripts():
     return {name: (ROOT / f"{name}.py").read_text() for name in SCRIPTS}
 
 
+@cache
 def definitions(text):
     """Where definitions stand: {name: (first, last line)}, from 1 on; with the imports and, as "", the docstring."""
     where = {}
@@ -197,6 +199,7 @@ def definitions(text):
     return where
 
 
+@cache
 def parts(text):
     """{name: source} of a script's definitions, and "the rest": what stands between them, without blank lines."""
     lines = text.splitlines()

@@ -270,6 +270,37 @@ def test_q_lambda_by_hand(script):
     torch.testing.assert_close(whole, torch.tensor([2.62, 2.0, 108.2955, 116.995, 12.0]))
 
 
+@with_and_without_state
+@pytest.mark.parametrize(
+    ("td_lambda", "expected"),
+    [
+        (0.0, [6.0, 12.0, 23.0, 8.0, 13.0]),
+        (0.5, [6.6875, 12.75, 23.0, 9.25, 13.0]),
+        (1.0, [7.75, 13.5, 23.0, 10.5, 13.0]),
+    ],
+)
+def test_q_lambda_reaches_back_to_the_first_row(script, td_lambda, expected):
+    """One agent with one macro-action. Episode 0 has three rows and a final one, episode 1 only two, and both are cut.
+
+    Rewards 1, 2, 3 and 4, 5. Discounts 0.5. Q' at the rows after these: 10, 20, 40 and 8, 16. With lambda 0.5:
+    G[2] = 3 + 20 = 23; G[1] = 2 + 0.5 (10 + 11.5) = 12.75; G[0] = 1 + 0.5 (5 + 6.375) = 6.6875; and in the shorter
+    one G[1] = 5 + 8 = 13; G[0] = 4 + 0.5 (4 + 6.5) = 9.25.
+    """
+    batch = {
+        "free": torch.tensor([[True] * 4, [True, True, True, False]])[..., None],
+        "action": torch.zeros(2, 4, 1, dtype=torch.int64),
+        "available": torch.ones(2, 4, 1, 1, dtype=torch.bool),
+        "valid": torch.tensor([[True, True, True, False], [True, True, False, False]]),
+        "reward": torch.tensor([[1.0, 2.0, 3.0, 0.0], [4.0, 5.0, 0.0, 0.0]]),
+        "discount": torch.tensor([[0.5, 0.5, 0.5, 1.0], [0.5, 0.5, 1.0, 1.0]]),
+        **{name: torch.zeros(2, 4, 1) for name in ("state", "last_state")},
+        "macro_state": torch.zeros(2, 4, 1, 1),
+    }
+    target_utilities = torch.tensor([[99.0, 10.0, 20.0, 40.0], [99.0, 8.0, 16.0, 16.0]])[..., None, None]
+    _, _, target = loss_of(script, torch.zeros(2, 4, 1, 1), target_utilities, batch, td_lambda=td_lambda)
+    torch.testing.assert_close(target, torch.tensor(expected))
+
+
 def test_mixers_see_the_choices_of_the_row_and_the_best_choices():
     """The mixer gets what was run, the target mixer what is best, and both what is available and their states."""
     batch = hand_made_batch()
