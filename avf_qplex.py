@@ -22,8 +22,7 @@ Numbered deviations from the paper:
     weighted by lambda_i(s, m), which depends on the others' choices. Greedy agents may miss the team's best choice,
     which breaks Mac-IGM (theory/README.md).
  2. A_i is Q_i - max Q_i as in Eq. 4. Def. 3.3 has a dueling head, whose advantages of any sign break Mac-IGM, too.
- 3. The mixer has two hidden layers of 128 units, one for s, one for s and m. The published mixer has a small network
-    for each head and purpose.
+ 3. The mixer has a hidden layer of 128 units for s and one for s and m, not small ones for each head and purpose.
  4. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
  5. Whole episodes are replayed, drawn with replacement, not windows of 25 rows. Targets are Q(lambda) returns. Negative
     TD errors count less while agents explore (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
@@ -82,7 +81,7 @@ class Args:
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
     hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
-    hidden_size: int = 64  # width of the agents' layers
+    hidden_size: int = 64  # width of the networks' layers
     ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities: learn, have no gradient, are 0
     mixer_state: Literal["joint", "single", "real", "real-both", "decision"] = "joint"  # see mixer_states
     mask_ongoing: bool = True  # busy agents have advantage 0 (deviation 1)
@@ -92,9 +91,10 @@ class Args:
         if problem:
             raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
-            low = 1 if type(value) is int and name not in ("seed", "learning_starts") else 0
+            kind = type(getattr(Args, name))
+            low = 1 if kind is int and name not in ("seed", "learning_starts") else 0
             high = 1 if name in AT_MOST_1 else 10**15
-            if type(value) in (int, float) and not low <= value <= high:
+            if kind in (int, float) and not low <= value <= high:
                 raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
@@ -525,7 +525,7 @@ def train(args):
             batch = make_batch(buffer.sample(args.batch_size, replay_rng), args.device)
             utilities = utilities_at_rows(learner["agents"], batch)
             target_utilities = utilities_at_rows(target["agents"], batch)
-            loss, joint_q, _ = td_loss(
+            loss, q, _ = td_loss(
                 utilities, target_utilities, learner["mixer"], target["mixer"], batch, args, hysteresis
             )
             optimizer.zero_grad()
@@ -537,7 +537,7 @@ def train(args):
             updates += 1
             if updates % 100 == 0:
                 writer.add_scalar("losses/td_loss", loss, step)
-                writer.add_scalar("losses/q_values", joint_q.mean(), step)
+                writer.add_scalar("losses/q_values", q.mean(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm, step)
 
         # ---- evaluate at each multiple of eval_frequency that was just passed; log, save ----

@@ -75,7 +75,7 @@ class Args:
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
     hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
-    hidden_size: int = 64  # width of the agents' layers
+    hidden_size: int = 64  # width of the networks' layers
     ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities: learn, have no gradient, are 0
 
     def __post_init__(self):
@@ -83,9 +83,10 @@ class Args:
         if problem:
             raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
-            low = 1 if type(value) is int and name not in ("seed", "learning_starts") else 0
+            kind = type(getattr(Args, name))
+            low = 1 if kind is int and name not in ("seed", "learning_starts") else 0
             high = 1 if name in AT_MOST_1 else 10**15
-            if type(value) in (int, float) and not low <= value <= high:
+            if kind in (int, float) and not low <= value <= high:
                 raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
@@ -300,8 +301,7 @@ def td_loss(utilities, target_utilities, batch, args, hysteresis=1.0):
 
     utilities, target_utilities: float32 [B, T, n, A], of the online and of the target networks.
     """
-    choices = utilities.masked_fill(~batch["available"], -torch.inf)
-    best = choices.argmax(-1)  # [B, T, n], m*
+    best = utilities.masked_fill(~batch["available"], -torch.inf).argmax(-1)  # [B, T, n], m*
     free = batch["free"][..., None]
     if args.ongoing == "detach":
         utilities = torch.where(free, utilities, utilities.detach())
@@ -451,7 +451,7 @@ def train(args):
             batch = make_batch(buffer.sample(args.batch_size, replay_rng), args.device)
             utilities = utilities_at_rows(learner["agents"], batch)
             target_utilities = utilities_at_rows(target["agents"], batch)
-            loss, joint_q, _ = td_loss(utilities, target_utilities, batch, args, hysteresis)
+            loss, q, _ = td_loss(utilities, target_utilities, batch, args, hysteresis)
             optimizer.zero_grad()
             loss.backward()
             grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
@@ -461,7 +461,7 @@ def train(args):
             updates += 1
             if updates % 100 == 0:
                 writer.add_scalar("losses/td_loss", loss, step)
-                writer.add_scalar("losses/q_values", joint_q.mean(), step)
+                writer.add_scalar("losses/q_values", q.mean(), step)
                 writer.add_scalar("losses/grad_norm", grad_norm, step)
 
         # ---- evaluate at each multiple of eval_frequency that was just passed; log, save ----

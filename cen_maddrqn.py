@@ -77,16 +77,17 @@ class Args:
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
     hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
-    hidden_size: int = 64  # width of the network's layers
+    hidden_size: int = 64  # width of the networks' layers
 
     def __post_init__(self):
         problem = envs.problem(self.env)
         if problem:
             raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
-            low = 1 if type(value) is int and name not in ("seed", "learning_starts") else 0
+            kind = type(getattr(Args, name))
+            low = 1 if kind is int and name not in ("seed", "learning_starts") else 0
             high = 1 if name in AT_MOST_1 else 10**15
-            if type(value) in (int, float) and not low <= value <= high:
+            if kind in (int, float) and not low <= value <= high:
                 raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
@@ -351,7 +352,7 @@ def train(args):
     env = envs.make(args.env, args.num_envs)
     eval_env = envs.make(args.env, args.eval_episodes)
     learner = make_learner(args, env)
-    target = copy.deepcopy(learner).requires_grad_(False)  # the target network, without gradients
+    target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, without gradients
     optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
     buffer = ReplayBuffer(env, args.buffer_size)
     parts = {

@@ -91,9 +91,10 @@ class Args:
         if problem:
             raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
-            low = 1 if type(value) is int and name not in ("seed", "random_timesteps") else 0
+            kind = type(getattr(Args, name))
+            low = 1 if kind is int and name not in ("seed", "random_timesteps") else 0
             high = 1 if name in AT_MOST_1 else 10**15
-            if type(value) in (int, float) and not low <= value <= high:
+            if kind in (int, float) and not low <= value <= high:
                 raise SystemExit(f"--{name.replace('_', '-')} must be from {low} to {high}, got {value}")
 
 
@@ -491,6 +492,8 @@ def train(args):
             returns = own_returns(target(batch), batch, args.n_step)
             losses = actor_critic_loss(policy, values, returns, batch, args.entropy_coef, hysteresis)
             loss, actor_loss, critic_loss, entropy = losses
+            if phase < 0:  # all policies are uniform, so only the critics learn
+                loss = critic_loss
             optimizer.zero_grad()
             loss.backward()
             grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)

@@ -242,7 +242,7 @@ class MacroVectorEnv(VectorEnv, ABC):
             if is_stuck.any():
                 env, agent = np.argwhere(is_stuck)[0]
                 raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
-            # Nobody chooses in an episode that is over. An empty set is filled there, so that whoever masks with it can.
+            # Nobody chooses in an episode that is over. An empty set is filled there, so that one can mask with it.
             self.available |= is_empty[:, :, None] & self.own_actions
 
     def _infos(self):

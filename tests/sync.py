@@ -47,7 +47,6 @@ GROUPS = {
     "Args.end_e": [Q_LEARNING, "mac_iaicc"],
     "Args.reward_scale": [Q_LEARNING, "mac_iaicc"],
     "Args.hysteresis": [Q_LEARNING, "mac_iaicc"],
-    "Args.hidden_size": [f"{AVF} dec_maddrqn", "cen_maddrqn", "mac_iaicc"],  # of the agents', one or two networks
     "DEFAULTS.bp-": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.wtd-t": [Q_LEARNING, "mac_iaicc"],
     "DEFAULTS.ct-": [Q_LEARNING, "mac_iaicc"],
@@ -64,40 +63,32 @@ OWN_LINES = {
 
         buffer.add_step(state, args.reward_scale * rewards, np.where(terminations, 0.0, args.gamma))
 
-            loss, joint_q, _ = td_loss(
+            loss, q, _ = td_loss(
                 utilities, target_utilities, learner["mixer"], target["mixer"], batch, args, hysteresis
             )
 """,
     "avf_vdn": """
-            loss, joint_q, _ = td_loss(utilities, target_utilities, batch, args, hysteresis)
+            loss, q, _ = td_loss(utilities, target_utilities, batch, args, hysteresis)
 """,
     "dec_maddrqn": """
             loss, q, _ = own_loss(utilities, target_utilities, batch, args, hysteresis)
 """,
     f"{AVF} dec_maddrqn": """
-    target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, without gradients
-
             utilities = utilities_at_rows(learner["agents"], batch)
             target_utilities = utilities_at_rows(target["agents"], batch)
 """,
     "cen_maddrqn": """
-    target = copy.deepcopy(learner).requires_grad_(False)  # the target network, without gradients
-
             values = values_at_rows(learner["agents"], batch)
             target_values = values_at_rows(target["agents"], batch)
             loss, q, _ = td_loss(values, target_values, learner["agents"], batch, args, hysteresis)
-""",
-    AVF: """
-                writer.add_scalar("losses/q_values", joint_q.mean(), step)
-""",
-    "dec_maddrqn cen_maddrqn": """
-                writer.add_scalar("losses/q_values", q.mean(), step)
 """,
     Q_LEARNING: """
     seeds = np.random.SeedSequence(args.seed).generate_state(5, np.uint64).tolist()
     network_seed, explore_seed, replay_seed, env_seed, eval_seed = seeds
 
     replay_rng = np.random.default_rng(replay_seed)
+
+    target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, without gradients
 
     buffer = ReplayBuffer(env, args.buffer_size)
 
@@ -118,6 +109,7 @@ OWN_LINES = {
 
             if updates % 100 == 0:
                 writer.add_scalar("losses/td_loss", loss, step)
+                writer.add_scalar("losses/q_values", q.mean(), step)
 
                 rngs=(explore_rng.bit_generator.state, replay_rng.bit_generator.state),
 """,
@@ -145,6 +137,8 @@ OWN_LINES = {
             returns = own_returns(target(batch), batch, args.n_step)
             losses = actor_critic_loss(policy, values, returns, batch, args.entropy_coef, hysteresis)
             loss, actor_loss, critic_loss, entropy = losses
+            if phase < 0:  # all policies are uniform, so only the critics learn
+                loss = critic_loss
 
             for slow, fast in zip(target.parameters(), learner["critics"].parameters(), strict=True):
 
