@@ -49,7 +49,7 @@ AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteres
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
     seed: int = 1  # of networks, exploration, replay and environments; at least 0
-    total_timesteps: int = 250_000  # environment steps of the run, over all environments
+    total_timesteps: int = 300_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
@@ -67,7 +67,7 @@ class Args:
     batch_size: int = 16  # episodes in an update
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
     learning_starts: int = 5_000  # environment steps with random macro-actions, before the first update
-    exploration_timesteps: int = 100_000  # environment steps after these over which epsilon falls from 1
+    exploration_timesteps: int = 150_000  # environment steps after these over which epsilon falls from 1
     end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
@@ -99,9 +99,8 @@ DEFAULTS = {
         exploration_timesteps=200_000,
         hysteresis=0.1,
     ),
-    "wtd-d": dict(total_timesteps=300_000),
     "wtd-t": dict(
-        total_timesteps=600_000,
+        total_timesteps=800_000,
         train_frequency=128,
     ),
     "ct-": dict(
