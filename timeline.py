@@ -10,7 +10,7 @@ from math import ceil
 from textwrap import wrap
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import rc_context, style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
@@ -48,6 +48,7 @@ LEGEND = [
 ]
 
 
+@style.context("default")  # whatever the user's own settings of matplotlib are
 def draw(episode, title, facts, steps=None):
     """The timeline of a play.Episode as a matplotlib Figure. title, facts: its first two lines.
 
@@ -167,8 +168,8 @@ def fold(words):
 
 def write(axes, x, y, words, **options):
     """Writes words at (x, y), where y is the middle of their height. The options are those of matplotlib's text."""
-    style = {"size": SMALL, "color": INK, "va": "center", **options}
-    axes.text(x, y, words, **style)
+    options = {"size": SMALL, "color": INK, "va": "center", **options}
+    axes.text(x, y, words, **options)
 
 
 # ---- strips ---------------------------------------------------------------------------------------------------------
