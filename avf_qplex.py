@@ -14,18 +14,18 @@ Asynchronous Multi-Agent Reinforcement Learning"). Three ideas carry the whole f
                target network, and m* is the argmax of the online network over what is available there (double Q).
 
 Shapes: N environments, B episodes, T rows, L decisions of an agent, n agents, A macro-actions of the agent that has
-most (for the others the rest is never available), d numbers of a macro-observation, S of a state, H hidden units.
+most (an agent with fewer never has the rest available), d numbers of a macro-observation, S of a state, H hidden units.
 
 Numbered deviations from the paper:
  1. V_i is the best of what is available to agent i, so a busy agent has A_i = 0, as in the authors' later revision of
     the paper. The paper takes the best of all macro-actions (--no-mask-ongoing). A busy agent can have A_i < 0 then,
     weighted by lambda_i(s, m), which depends on the others' choices. Greedy agents may miss the team's best choice,
     which breaks Mac-IGM (theory/README.md).
- 2. A_i is Q_i - max Q_i as in Eq. 4. Def. 3.3 has a dueling head, whose advantages of any sign break Mac-IGM, too.
- 3. The mixer has a hidden layer of 128 units for s and one for s and m, not small ones for each head and purpose.
+ 2. A_i is Q_i - max Q_i <= 0 (Eq. 4). A dueling head (Def. 3.3) lets A_i be positive, which breaks Mac-IGM, too.
+ 3. The mixer is two networks with 128 hidden units, of s and of (s, m), not a small one for each head and purpose.
  4. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
  5. Whole episodes are replayed, drawn with replacement, not windows of 25 rows. Targets are Q(lambda) returns. Negative
-    TD errors count less while agents explore (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
+    TD errors count less at first (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
 """
 
 import argparse
@@ -73,16 +73,16 @@ class Args:
     batch_size: int = 16  # episodes in an update
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
     learning_starts: int = 5_000  # environment steps with random macro-actions, before the first update
-    exploration_timesteps: int = 150_000  # environment steps after these over which epsilon falls from 1
+    exploration_timesteps: int = 150_000  # environment steps over which epsilon then falls from 1
     end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
-    hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps as that
     hidden_size: int = 64  # width of the networks' layers
-    ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities: learn, have no gradient, are 0
+    ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities learn, are constants, or are 0
     mixer_state: Literal["joint", "single", "real", "real-both", "decision"] = "joint"  # see mixer_states
     mask_ongoing: bool = True  # busy agents have advantage 0 (deviation 1)
 
@@ -91,7 +91,7 @@ class Args:
         if problem:
             raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
-            kind = type(getattr(Args, name))
+            kind = type(getattr(Args, name))  # of the default
             low = 1 if kind is int and name not in ("seed", "learning_starts") else 0
             high = 1 if name in AT_MOST_1 else 10**15
             if kind in (int, float) and not low <= value <= high:
@@ -191,7 +191,7 @@ def utilities_at_rows(agents, batch):
     """
     free = batch["free"].movedim(2, 0)  # [n, B, T]
     decision = free.cumsum(2) - 1  # [n, B, T], index of the latest decision: 0 0 1 if free is 1 0 1
-    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first: 0 2 1
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], decisions' rows, then the others: 0 2 1
     row = row[:, :, : int(decision.max()) + 1]  # [n, B, L]; after an agent's last decision come busy rows, never read
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
@@ -203,8 +203,8 @@ class QPLEXMixer(nn.Module):
     """Duplex dueling (Eqs. 3 and 4; Wang et al. 2021): Q = sum_i (V_i + lambda_i A_i), A_i = Q_i - V_i, lambda_i > 0.
 
     Q_i and V_i are first transformed to w_i(s) Q_i + b_i(s) with w_i > 0; b_i cancels in A_i. lambda_i is a sum over
-    heads of key(s) sigmoid(agent_i(s)) sigmoid(action_i(s, m)). As it is positive, an agent's term is largest, V_i, at
-    its best choice. own_actions: bool [n, A], which macro-actions each agent has.
+    heads of key(s) sigmoid(agent_i(s)) sigmoid(action_i(s, m)). As lambda_i > 0 >= A_i, an agent's term is at most V_i,
+    reached at its best choice. own_actions: bool [n, A], which macro-actions each agent has.
     """
 
     def __init__(self, own_actions, state_size, hidden=128, heads=4, mask_ongoing=True):
@@ -232,7 +232,7 @@ class QPLEXMixer(nn.Module):
         weight, bias, key, agent_logits = self.state_net(state).split([n, n, self.heads, self.heads * n], -1)
         weight = weight.abs() + 1e-10  # positive: the transform keeps each agent's order of macro-actions
         key = key.abs() + 1e-10
-        advantage = (weight * (q - v)).detach()  # lambda_i learns from it, the utilities do not
+        advantage = (weight * (q - v)).detach()  # only lambda_i learns from it
         joint_action = nn.functional.one_hot(actions, n_actions).flatten(-2)  # [B, T, n * A]
         action_logits = self.action_net(torch.cat([state, joint_action], -1))
         attention = torch.sigmoid(agent_logits) * torch.sigmoid(action_logits)
@@ -255,7 +255,7 @@ class ReplayBuffer:
             ("action", np.int64, (n_agents,)),  # the macro-action that it runs from here on
             ("since", np.int64, (n_agents,)),  # the row at which it chose that macro-action
             ("state", np.float32, (env.state_size,)),  # the true state
-            ("last_state", np.float32, (env.state_size,)),  # that at the last step before the next row
+            ("last_state", np.float32, (env.state_size,)),  # the true state a step before the next row
             ("reward", np.float32),  # the sum of gamma^t r_t over the tau steps until the next row
             ("discount", np.float32),  # gamma^tau, or 0 if the episode terminates at the next row
         ]
@@ -278,7 +278,7 @@ class ReplayBuffer:
         rows["action"] = actions[e]
         rows["since"] = np.where(free[e], k[:, None], since_before)
         rows["state"] = infos["state"][e]
-        rows["last_state"] = infos["state"][e]
+        rows["last_state"] = infos["state"][e]  # stays so at a final row
         rows["discount"] = 1.0
         self.running[e, k] = rows
         self.running_rows[e] += 1
@@ -286,7 +286,7 @@ class ReplayBuffer:
     def add_step(self, state, rewards, discounts):
         """Adds a time step to the latest row of every running episode.
 
-        state: float32 [N, S], before the step. rewards: float64 [N]. discounts: float64 [N], gamma or, at the end, 0.
+        state: float32 [N, S], before the step. rewards: float64 [N]. discounts: float64 [N], gamma, or 0 if terminal.
         """
         latest = np.arange(len(rewards)), self.running_rows - 1
         rows = self.running[latest]
@@ -296,7 +296,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Gives episodes that are over, bool [N], a final row, where all agents are free, and moves them to `ended`."""
+        """Moves episodes that are over, bool [N], to `ended`, after a final row, at which macro_done holds for all."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -336,7 +336,7 @@ def make_batch(episodes, device="cpu"):
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # what it ran before it chose
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # that of the row before `since`
     batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
     batch["previous"] = np.where(since > 0, previous, -1)
@@ -346,9 +346,9 @@ def make_batch(episodes, device="cpu"):
 
 
 def mixer_states(batch, kind):
-    """The mixer's states at each row: for its Q, and for its Q', from which the row before bootstraps.
+    """Two mixer states for each row: one for its Q, one for its Q', the bootstrap of the row before.
 
-    Both are float32 [B, T, S], or [B, T, n * S] for "joint".
+    Both are float32 [B, T, S], or [B, T, n * S] for "joint". The last row's Q is never used.
     """
     state, last_state, macro_state = (batch[name] for name in ("state", "last_state", "macro_state"))
     joint = macro_state.flatten(2)
@@ -356,9 +356,9 @@ def mixer_states(batch, kind):
     single = macro_state.take_along_dim(agent[..., None, None], 2)[:, :, 0]
     kinds = {
         "joint": (joint, joint),  # the macro-states of all agents, the paper's method
-        "single": (single, state),  # the macro-state of an agent free at the next row; for Q' the row's state
-        "real": (last_state, state),  # the state at the last step before the next row; for Q' the row's state
-        "real-both": (last_state, last_state),  # that last state for both
+        "single": (single, state),  # the macro-state of an agent free at the next row, which is `state` there
+        "real": (last_state, state),  # the state a step before the next row; for Q' the row's state
+        "real-both": (last_state, last_state),  # the state a step before the next row for both
         "decision": (state, state),  # the row's state for both
     }
     return kinds[kind]
@@ -377,10 +377,10 @@ def td_loss(utilities, target_utilities, mixer, target_mixer, batch, args, hyste
     if args.ongoing == "zero":
         utilities = torch.where(free, utilities, 0.0)
         target_utilities = torch.where(free, target_utilities, 0.0)
-    state, next_state = mixer_states(batch, args.mixer_state)
+    state, target_state = mixer_states(batch, args.mixer_state)
     q = mixer(utilities, batch["action"], available, state)[:, :-1]  # [B, T - 1]
     with torch.no_grad():
-        next_q = target_mixer(target_utilities, best, available, next_state)[:, 1:]  # [B, T - 1], of the next row
+        next_q = target_mixer(target_utilities, best, available, target_state)[:, 1:]  # [B, T - 1], of the next row
         reward, discount, valid = (batch[name][:, :-1] for name in ("reward", "discount", "valid"))
         target = reward + discount * next_q
         # Backwards: y[k] = r[k] + gamma^tau ((1 - lambda) next_q[k] + lambda y[k + 1]), lambda = 0 if k + 1 is final.
@@ -396,12 +396,12 @@ def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
     """Epsilon-greedy macro-actions int64 [N, n] and new hidden states. A busy agent can only go on.
 
     obs: float32 [N, n, d]. infos: those of the last reset or step. hidden: float32 [n, N, H]; only those of free
-    agents change.
+    agents change. A busy agent has one choice, so its utilities do not matter.
     """
     free = infos["macro_done"]
     available = infos["available"]
     own_obs = torch.from_numpy(obs).to(hidden.device).transpose(0, 1)[:, :, None]  # [n, N, 1, d]
-    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)  # used where free
+    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)
     with torch.no_grad():
         utilities, new_hidden = agents(own_obs, previous, hidden)
     is_free = torch.from_numpy(free.T[..., None]).to(hidden.device)  # [n, N, 1]

@@ -12,8 +12,8 @@ execute it on their own. Three ideas carry the whole file:
     target     y = r + gamma^tau Q'(h', m*) (Eq. 5). h' and m* are of the next row, tau steps later. Q' is the target
                network, and m* is the argmax of the online network over what is available there (double Q).
 
-Shapes: N environments, B episodes, T rows, n agents, A macro-actions of the agent that has most (for the others the
-rest is never available), J joint macro-actions, d numbers of a macro-observation, H hidden units.
+Shapes: N environments, B episodes, T rows, n agents, A macro-actions of the agent that has most (an agent with fewer
+never has the others available), J joint macro-actions, d numbers of a macro-observation, H hidden units.
 
 Numbered deviations from the paper and from the published baseline:
  1. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
@@ -21,7 +21,7 @@ Numbered deviations from the paper and from the published baseline:
     alone, and it has an LSTM where this one has a GRU.
  3. The target network follows by Polyak averaging. The published one is copied now and then.
  4. Whole episodes are replayed, drawn with replacement. Targets are Q(lambda) returns. Negative TD errors count less
-    while the team explores (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
+    at first (--hysteresis, on Box Pushing). docs/defaults.md explains all values.
 """
 
 import argparse
@@ -69,14 +69,14 @@ class Args:
     batch_size: int = 16  # episodes in an update
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
     learning_starts: int = 5_000  # environment steps with random macro-actions, before the first update
-    exploration_timesteps: int = 150_000  # environment steps after these over which epsilon falls from 1
+    exploration_timesteps: int = 150_000  # environment steps over which epsilon then falls from 1
     end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
-    hysteresis: float = 1.0  # factor on negative TD errors; after epsilon's fall it rises to 1 over as many steps
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps as that
     hidden_size: int = 64  # width of the networks' layers
 
     def __post_init__(self):
@@ -84,7 +84,7 @@ class Args:
         if problem:
             raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
-            kind = type(getattr(Args, name))
+            kind = type(getattr(Args, name))  # of the default
             low = 1 if kind is int and name not in ("seed", "learning_starts") else 0
             high = 1 if name in AT_MOST_1 else 10**15
             if kind in (int, float) and not low <= value <= high:
@@ -216,7 +216,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Gives episodes that are over, bool [N], a final row, where all agents are free, and moves them to `ended`."""
+        """Moves episodes that are over, bool [N], to `ended`, after a final row, at which macro_done holds for all."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -255,7 +255,7 @@ def make_batch(episodes, device="cpu"):
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # what it ran before it chose
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # that of the row before `since`
     batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
     batch["previous"] = np.where(since > 0, previous, -1)

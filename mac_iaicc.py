@@ -17,7 +17,7 @@ Parallel environments play whole episodes. When batch_size or more of them have 
 of these, and they are deleted.
 
 Shapes: N environments, B episodes, T rows, L decisions of an agent, n agents, A macro-actions of the agent that has
-most (for the others the rest is never available), d numbers of a macro-observation, H hidden units.
+most (an agent with fewer never has the others available), d numbers of a macro-observation, H hidden units.
 
 Numbered deviations from the published baseline:
  1. Episodes go on while gradient steps are taken, so an older policy may have played the beginning of one.
@@ -77,13 +77,13 @@ class Args:
     polyak: float = 0.95  # share of the target critics kept at each update; higher is slower
     random_timesteps: int = 0  # environment steps at first with epsilon 1, from which only the critics learn
     start_e: float = 0.5  # share epsilon of the uniform policy once random_timesteps are over
-    exploration_timesteps: int = 150_000  # environment steps after random_timesteps over which epsilon falls
+    exploration_timesteps: int = 150_000  # environment steps over which epsilon then falls
     end_e: float = 0.01  # final epsilon
     entropy_coef: float = 0.01  # weight of the policies' entropy in the loss; bigger explores longer
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.01  # factor on rewards inside the loss; logged returns are unscaled
-    hysteresis: float = 1.0  # factor on critics' negative errors; after epsilon's fall it rises to 1 over as many steps
+    hysteresis: float = 1.0  # factor on critics' negative errors; rises to 1 after epsilon's fall, in as many steps
     hidden_size: int = 64  # width of the networks' layers
 
     def __post_init__(self):
@@ -91,7 +91,7 @@ class Args:
         if problem:
             raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
-            kind = type(getattr(Args, name))
+            kind = type(getattr(Args, name))  # of the default
             low = 1 if kind is int and name not in ("seed", "random_timesteps") else 0
             high = 1 if name in AT_MOST_1 else 10**15
             if kind in (int, float) and not low <= value <= high:
@@ -189,7 +189,7 @@ def logits_at_rows(agents, batch):
     """
     free = batch["free"].movedim(2, 0)  # [n, B, T]
     decision = free.cumsum(2) - 1  # [n, B, T], index of the latest decision: 0 0 1 if free is 1 0 1
-    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], rows with a decision first: 0 2 1
+    row = torch.argsort(~free, dim=2, stable=True)  # [n, B, T], decisions' rows, then the others: 0 2 1
     row = row[:, :, : int(decision.max()) + 1]  # [n, B, L]; after an agent's last decision come busy rows, never read
     obs = batch["obs"].movedim(2, 0).take_along_dim(row[..., None], 2)  # from rows to decisions
     previous = batch["previous"].movedim(2, 0).take_along_dim(row, 2)
@@ -269,7 +269,7 @@ class EpisodeBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Gives episodes that are over, bool [N], a final row, where all agents are free, and moves them to `ended`."""
+        """Moves episodes that are over, bool [N], to `ended`, after a final row, at which macro_done holds for all."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -304,7 +304,7 @@ def make_batch(episodes, device="cpu"):
     rows = np.stack([episode[np.minimum(row, len(episode) - 1)] for episode in episodes])  # [B, T]
     batch = {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
     since = batch["since"]  # [B, T, n]
-    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # what it ran before it chose
+    previous = np.take_along_axis(batch["action"], since - 1, axis=1)  # that of the row before `since`
     batch["valid"] = row < length[:, None] - 1
     batch["free"] = since == row[:, None]
     batch["previous"] = np.where(since > 0, previous, -1)
@@ -367,7 +367,7 @@ def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
     """
     free = infos["macro_done"]
     own_obs = torch.from_numpy(obs).to(hidden.device).transpose(0, 1)[:, :, None]  # [n, N, 1, d]
-    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)  # used where free
+    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)
     available = torch.from_numpy(infos["available"]).to(hidden.device)
     with torch.no_grad():
         logits, new_hidden = agents(own_obs, previous, hidden)
