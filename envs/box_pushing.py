@@ -30,8 +30,8 @@ PUSH, TURN_LEFT, TURN_RIGHT, STAY = 4, 5, 6, 7
 PRIMITIVE_NAMES = ["Forward", "Turn-left", "Turn-right", "Stay"]
 PRIMITIVE_TO_MACRO = np.array([PUSH, TURN_LEFT, TURN_RIGHT, STAY])
 
-# Go-to chooses its next cell by costs, which are no rewards. These are the costs of 0 to 3 quarter turns to the right,
-# of which three are one to the left.
+# Go-to chooses its next cell by cost, which is not a reward. Entry k is the cost of k quarter turns to the right.
+# Three to the right cost 0.1, because they are the same as one to the left.
 TURN_COST = np.array([0.0, 0.1, 0.2, 0.1])
 SMALL, BIG = slice(0, 2), 2  # boxes 0 and 1 are small, box 2 is big
 
@@ -57,10 +57,10 @@ class BoxPushing(MacroVectorEnv):
       cells in the order N, E, S, W:
         - The cost of a cell is its Manhattan distance to the waypoint, plus 0.1 for each quarter turn that the agent
           needs to face it.
-        - What blocks the way are the four cells in the present row of small box 0 and in the columns of the two small
-          boxes and of the two halves of the big one. They cost infinitely much. At the published start these are the
-          boxes' own cells; later on they need not be. The boundary blocks nothing. Both are quirks of the published
-          benchmark, and they are kept.
+        - Four cells are blocked: their cost is infinite. All are in the row in which small box 0 is now, one in the
+          column of each small box and one in the column of each half of the big box. At the published start these are
+          the boxes' own cells; later on they need not be. A cell outside the grid is not blocked. Both rules are quirks
+          of the published benchmark, and they are kept.
         - The agent chooses the cheapest cell, the first of equals. If it faces the cell, it moves there. If the cell is
           behind it, it makes one quarter turn to the right. Otherwise it turns to face the cell.
     - 4 Push: what it does depends on the cell in front of the agent.
@@ -69,8 +69,8 @@ class BoxPushing(MacroVectorEnv):
         - The boundary of the grid, the big box, or a small box while the agent does not face north: the agent stays
           where it is, gets a penalty, and Push ends.
         - Anything else: the agent moves one cell forward. Push ends when it then has the boundary in front of it.
-    - Joint push: it begins if both agents start Push in the same step, both face north, and of the Go-tos that each of
-      them has finished last, one is Go-to-Big-Box(left) and the other Go-to-Big-Box(right). The agents may have left
+    - Joint push: it begins if both agents start Push in the same step, both face north, and the last Go-to that they
+      finished was Go-to-Big-Box(left) for one of them and Go-to-Big-Box(right) for the other. The agents may have left
       these waypoints since. This is a quirk of the published benchmark, and it is kept. A joint push goes on until the
       big box is on the goal row.
     - 5 Turn-left, 6 Turn-right, 7 Stay: they last one step.
@@ -230,8 +230,8 @@ class BoxPushing(MacroVectorEnv):
             penalised[:, agent] = push_penalised
 
         self._push_big_box()
-        # A small box can move two cells in a step, beyond the goal row: if agent 0 pushes it into the cell in front of
-        # agent 1, agent 1 pushes it on.
+        # Not ==, because a small box can move two cells in a step, and so beyond the goal row. It does if agent 1 is in
+        # the same cell as the box: agent 0 pushes the box into the cell in front of agent 1, which then pushes it on.
         on_goal_row = self.box_y >= self.goal_y  # [N, boxes]
         small_on_goal_row = on_goal_row[:, SMALL]
         big_on_goal_row = on_goal_row[:, BIG]
@@ -250,16 +250,16 @@ class BoxPushing(MacroVectorEnv):
 
     def _lock_onto_big_box(self, action):
         """Begins a joint push where both agents start Push and face north, one at each half of the big box."""
-        starts = self.macro_done  # free up to this step
+        starts = self.macro_done  # still that of the step before: who was free then starts an action now
         both_start_push = (starts & (action == PUSH)).all(axis=1)
         both_face_north = (self.orientation == NORTH).all(axis=1)
-        if self.primitive:  # the agents' cells count
+        if self.primitive:  # it matters where the agents are now
             x = self.position[:, :, 0]
             y = self.position[:, :, 1]
             is_below = y == self.box_y[:, BIG, None] - 1  # [N, agents]
             at_left_half = is_below & (x == self.cell_x[WAYPOINT_BIG_LEFT])
             at_right_half = is_below & (x == self.cell_x[WAYPOINT_BIG_RIGHT])
-        else:  # the waypoints that they reached last count
+        else:  # it matters which Go-to each agent finished last
             at_left_half = self.last_waypoint == WAYPOINT_BIG_LEFT
             at_right_half = self.last_waypoint == WAYPOINT_BIG_RIGHT
         one_at_each_half = at_left_half.any(axis=1) & at_right_half.any(axis=1)
@@ -328,6 +328,7 @@ class BoxPushing(MacroVectorEnv):
         small_y[moved_boxes] += 1
 
         box_arrives = (moved_boxes & (small_y >= self.goal_y)).any(axis=1)
+        # An agent that walks is in the cell `front` now, so `front + step` is the cell that it has in front of it.
         reaches_boundary = walks & ~pushes_small & self._is_outside(front + step)
         ends = penalised | box_arrives | reaches_boundary
         return ends, penalised

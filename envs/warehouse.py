@@ -99,9 +99,9 @@ class Warehouse(MacroVectorEnv):
 
     - 0: Wait-M takes 1 step and does nothing.
     - 1..R: Pass-to-M(j) takes 4 steps. At its end robot j gets the oldest staged tool, and the robot's Get-Tool ends.
-      If nothing is staged, the Get-Tool ends all the same. Robot j has to wait at the table in the first and in the
-      last step of the Pass, both looked at after the robots have moved, or the Pass fails. A Pass that fails takes its
-      4 steps, too, and is penalised at their end.
+      If nothing is staged, the Get-Tool ends all the same, without a penalty. The Pass fails unless robot j waits at
+      the table both in the first and in the last step of the Pass. In each of these two steps the arm looks for the
+      robot after the robots have moved. A Pass that fails takes its 4 steps, too, and is penalised at their end.
     - R+1..R+3: Search-Tool(k) takes 6 steps. At its end a copy of tool k is staged if not all of its copies have been
       found and there is room for one more tool.
 
@@ -144,8 +144,8 @@ class Warehouse(MacroVectorEnv):
     Then for the arm 14 + R numbers:
 
     - (3) how many of each tool are staged; a tool that is being passed counts until the Pass ends
-    - (3) the tool in its hand, one-hot: during a Pass that began with its robot waiting, the oldest staged tool; zeros
-      otherwise
+    - (3) the tool in the arm's hand, one-hot. During a Pass whose robot j waited in the first step, this is the oldest
+      staged tool. Otherwise it is zeros.
     - (3) how many of each tool have been found so far
     - (1) steps left of its macro-action / length of its longest macro-action
     - (4 + R) its running macro-action, one-hot, zeros when none is running
@@ -194,8 +194,8 @@ class Warehouse(MacroVectorEnv):
     - staged int [N, C], queue of tools, oldest first, -1 for an empty place
     - found int [N, 3], copies of each tool found so far
     - arm_left int [N], steps left of the arm's macro-action
-    - pass_ready bool [N], True from the start of a Pass whose robot was waiting then until the arm starts its next
-      macro-action
+    - pass_ready bool [N], whether the arm's macro-action is a Pass whose robot j waited in the first step. It keeps its
+      value until the arm starts its next macro-action.
     - phase int [N, H], 0..3
     - clock int [N, H], steps left of the phase. It is 0 or less while the human waits for its tool and when it has
       finished the fourth phase.
@@ -422,7 +422,7 @@ class Warehouse(MacroVectorEnv):
             gives_up bool [N, R], whether the robot's Get-Tool ends because it has waited in vain for long enough.
         """
         was_under_way = self.under_way  # in the step before
-        waits = at_table & ~was_under_way
+        waits = at_table & ~was_under_way  # one that was under way arrives now; its waiting begins in the next step
         self.waited[waits] += 1
         self.waited[under_way] = 0
         self.under_way = under_way
@@ -433,7 +433,7 @@ class Warehouse(MacroVectorEnv):
     def _deliver(self, arrived, destination):
         """Robots that have reached a workshop give its human the next tool; returns the rewards, float64 [N]."""
         visits = arrived[:, :, None] & one_hot(destination, self.n_humans)  # [N, R, H]
-        needed = np.minimum(self.phase, TOOLS - 1)  # [N, H]; not used in the last phase
+        needed = np.minimum(self.phase, TOOLS - 1)  # [N, H]: in phase p tool p is next; not used in the last phase
         receives = np.zeros_like(self.has_next_tool)
         for robot in range(self.n_robots):  # one after the other: two may bring a human the same tool
             carries = np.take_along_axis(self.carried[:, robot], needed, axis=1) > 0  # [N, H]
@@ -472,6 +472,7 @@ class Warehouse(MacroVectorEnv):
             served bool [N, R], whether the Pass ends the robot's Get-Tool, and fails bool [N], whether the Pass fails.
         """
         pass_ends = self._receiver(arm_action) & arm_ends[:, None]  # [N, R]
+        # A robot on Get-Tool with a count of 1 or more is at the table, because under way the count is 0.
         served = pass_ends & self.pass_ready[:, None] & gets_tool & (self.waited >= 1)
         fails = (pass_ends & ~served).any(axis=1)
         self.waited[served] = 0
@@ -530,7 +531,7 @@ class Warehouse(MacroVectorEnv):
         phases_seen = phase_here.reshape(self.num_envs, self.n_robots, -1)
 
         sees_queue = self.location >= self.tool_room_place  # not at a workshop
-        n_staged = one_hot(self._n_staged() - 1, self.staging_capacity)  # [N, C]
+        n_staged = one_hot(self._n_staged() - 1, self.staging_capacity)  # [N, C], zeros if none is staged
         n_staged_seen = sees_queue[:, :, None] & n_staged[:, None]
         return np.concatenate([place, phases_seen, self.carried, n_staged_seen], axis=2)
 
