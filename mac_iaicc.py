@@ -58,7 +58,7 @@ AT_MOST_1 = ("learning_rate", "gamma", "polyak", "start_e", "end_e", "hysteresis
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
     seed: int = 1  # of networks, exploration and environments; at least 0
-    total_timesteps: int = 300_000  # environment steps of the run, over all environments
+    total_timesteps: int = 400_000  # environment steps of the run, over all environments
     num_envs: int = 4  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
@@ -77,7 +77,7 @@ class Args:
     polyak: float = 0.95  # share of the target critics kept at each update; higher is slower
     random_timesteps: int = 0  # environment steps at first with epsilon 1, from which only the critics learn
     start_e: float = 0.5  # share epsilon of the uniform policy once random_timesteps are over
-    exploration_timesteps: int = 150_000  # environment steps over which epsilon then falls
+    exploration_timesteps: int = 200_000  # environment steps over which epsilon then falls
     end_e: float = 0.01  # final epsilon
     entropy_coef: float = 0.01  # weight of the policies' entropy in the loss; bigger explores longer
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
@@ -109,6 +109,7 @@ DEFAULTS = {
     "wtd-t": dict(total_timesteps=800_000),
     "ct-": dict(
         total_timesteps=600_000,
+        exploration_timesteps=150_000,
         num_envs=32,
         eval_episodes=400,
         learning_rate=5e-4,

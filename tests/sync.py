@@ -39,6 +39,7 @@ GROUPS = {
     "train": ["avf_vdn", WITH_MIXER, "dec_maddrqn", "cen_maddrqn", "mac_iaicc"],  # but for OWN_LINES it is the same
     "Args.__post_init__": [Q_LEARNING, "mac_iaicc"],
     "Args.seed": [Q_LEARNING, "mac_iaicc"],  # no replay
+    "Args.total_timesteps": [Q_LEARNING, "mac_iaicc"],
     "Args.num_envs": [Q_LEARNING, "mac_iaicc"],
     "Args.gamma": [Q_LEARNING, "mac_iaicc"],
     "Args.batch_size": [Q_LEARNING, "mac_iaicc"],
