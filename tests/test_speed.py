@@ -56,7 +56,7 @@ def table(capsys):
 def test_every_measure_is_taken(tmp_path, capsys, monkeypatch):
     """Acting is the script's, training a stand-in's: the tests below have the real script's word on its flags."""
     monkeypatch.setattr(speed.record, "ROOT", stand_in(tmp_path, 0.0, 0.00001, 0.001))
-    monkeypatch.setattr(speed, "CALLS", 30)
+    monkeypatch.setattr(speed, "CALLS", 300)
     speed.main(TINY)
     measured = {name: float(each) for name, (each,) in table(capsys).items()}
     assert list(measured) == NAMES and all(0 < each < 1000 for each in measured.values())
