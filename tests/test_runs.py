@@ -33,11 +33,18 @@ def flags(options):
 
 
 def start(script, *arguments):
-    """The script as a program in a process of its own, which buffers what it prints."""
+    """The script as a program in a process of its own, which buffers what it prints.
+
+    Ctrl-C reaches it even if these tests run in the background of a shell, where programs inherit that it is ignored.
+    """
     command = [sys.executable, str(ROOT / f"{script}.py"), *map(str, arguments)]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    return subprocess.Popen(command, cwd=ROOT, env=environment, text=True, **pipes)
+
+    def heed_ctrl_c():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    return subprocess.Popen(command, cwd=ROOT, env=environment, text=True, preexec_fn=heed_ctrl_c, **pipes)
 
 
 def run_as_program(monkeypatch, *arguments, script="avf_qplex"):
@@ -187,18 +194,6 @@ def test_interrupted_and_resumed_equals_undisturbed(tmp_path, monkeypatch, scrip
     assert_same_run(undisturbed, folder)
 
 
-def send_until_it_ends(process, number):
-    """What it printed. Python drops a Ctrl-C that falls into a destructor, so a person may have to press it again."""
-    for _ in range(6):
-        process.send_signal(number)
-        try:
-            return process.communicate(timeout=10)
-        except subprocess.TimeoutExpired:
-            continue
-    process.kill()
-    return process.communicate()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_program_that_is_stopped(tmp_path, monkeypatch, number):
@@ -206,7 +201,8 @@ def test_a_program_that_is_stopped(tmp_path, monkeypatch, number):
     options = {**TINY, "runs_dir": tmp_path, "checkpoint_frequency": 0, "total_timesteps": 100_000}
     process = start("avf_vdn", "--env=bp-10", *flags(options))
     wait_for(lambda: any(tmp_path.glob("*/checkpoint.pt")) or process.poll() is not None)
-    printed, errors = send_until_it_ends(process, number)
+    process.send_signal(number)
+    printed, errors = process.communicate(timeout=60)
     (folder,) = tmp_path.iterdir()
     said = [line for line in errors.splitlines() if not line.startswith("step ")]  # but for evaluations
     assert printed == f"{folder}\n", "it is shown at once"
