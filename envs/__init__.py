@@ -14,10 +14,10 @@ from envs.capture_target import CaptureTarget
 from envs.core import MacroVectorEnv, SingleMacroEnv
 from envs.warehouse import Warehouse
 
-_TASKS = {}  # id: (domain, its keywords)
+_TASKS = {}  # id: (domain, its keywords, default settings of the scripts)
 
 
-def register(env_id, domain, **kwargs):
+def register(env_id, domain, defaults=None, **kwargs):
     """Makes a task known to `make`, to `--env` of the scripts and, as `env_id` + "-v0", to Gymnasium.
 
     `make("module:id")` imports the module first, so a task may be registered in a file of its own.
@@ -25,6 +25,8 @@ def register(env_id, domain, **kwargs):
     Args:
         env_id: letters, digits, and "-", "_", "." between them.
         domain: a `MacroVectorEnv`, called as `domain(num_envs=..., **kwargs)`.
+        defaults: settings of the scripts for this task, such as {"gamma": 0.98}. Flags on the command line win. A
+            setting that a script does not have is ignored by it.
 
     Raises:
         ValueError: there is a task of this id.
@@ -33,11 +35,11 @@ def register(env_id, domain, **kwargs):
     if env_id in _TASKS:
         raise ValueError(f"there is an environment {env_id!r} already")
     gym.register(f"{env_id}-v0", "envs:make_single", vector_entry_point="envs:make", kwargs={"env_id": env_id})
-    _TASKS[env_id] = domain, kwargs
+    _TASKS[env_id] = domain, kwargs, defaults or {}
 
 
 def _find(env_id):
-    """The domain of a task and its keywords; raises as `make`."""
+    """The domain of a task, its keywords and its default settings; raises as `make`."""
     module, _, name = str(env_id).rpartition(":")
     if module:
         importlib.import_module(module)
@@ -56,6 +58,17 @@ def problem(env_id):
         return str(error)
 
 
+def defaults(env_id, args_class):
+    """Settings that a task was registered with, {name: value}, without those that a script's `Args` does not have.
+
+    They are none for an id that `make` does not know.
+    """
+    if problem(env_id):
+        return {}
+    _, _, settings = _find(env_id)
+    return {name: value for name, value in settings.items() if hasattr(args_class, name)}
+
+
 def make(env_id, num_envs=1, **kwargs) -> MacroVectorEnv:
     """Makes a batch of environments.
 
@@ -68,7 +81,7 @@ def make(env_id, num_envs=1, **kwargs) -> MacroVectorEnv:
         ValueError: the id is unknown or an argument is out of range.
         ImportError: there is no such module.
     """
-    domain, task = _find(env_id)
+    domain, task, _ = _find(env_id)
     return domain(num_envs=num_envs, **{**task, **kwargs})
 
 

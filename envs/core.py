@@ -261,13 +261,10 @@ class MacroVectorEnv(VectorEnv, ABC):
         return base + self.sim_arrays
 
     def save_state(self):
-        """All that the simulator needs to go on, a dict of arrays.
-
-        Its entry "np_random" is the state of the random generator: JSON, as an array of bytes.
-        """
-        arrays = {name: getattr(self, name).copy() for name in self._checkpointed()}
-        generator = json.dumps(self.np_random.bit_generator.state)
-        return arrays | {"np_random": np.frombuffer(generator.encode(), np.uint8).copy()}
+        """All that the simulator needs to go on: for each array its bytes, and as "np_random" the generator's JSON."""
+        state = {name: getattr(self, name).tobytes() for name in self._checkpointed()}
+        state["np_random"] = json.dumps(self.np_random.bit_generator.state)
+        return state
 
     def load_state(self, saved):
         """Continues from what `save_state` returned.
@@ -278,12 +275,16 @@ class MacroVectorEnv(VectorEnv, ABC):
         Raises:
             ValueError: it was saved by another domain, or by one with other sizes or another number of environments.
         """
-        for name in self._checkpointed():
-            if name not in saved or np.shape(saved[name]) != getattr(self, name).shape:
-                raise ValueError(f"the saved state is of another environment: {name!r} is missing or of another shape")
-        for name in self._checkpointed():
-            setattr(self, name, np.asarray(saved[name]).copy())
-        self.np_random.bit_generator.state = json.loads(bytes(np.asarray(saved["np_random"])))
+        arrays = {name: getattr(self, name) for name in self._checkpointed()}
+        for name, array in arrays.items():
+            if len(saved.get(name, b"")) != array.nbytes:
+                raise ValueError(f"the saved state is of another environment: {name!r} is missing or of another size")
+        if "np_random" not in saved:
+            raise ValueError("the saved state has no random generator, 'np_random'")
+        for name, array in arrays.items():
+            loaded = np.frombuffer(saved[name], array.dtype).reshape(array.shape)
+            setattr(self, name, loaded.copy())
+        self.np_random.bit_generator.state = json.loads(saved["np_random"])
         self._update_available()
         return self._obs.copy(), self._infos()
 

@@ -113,9 +113,9 @@ def test_drawing_changes_neither_the_environment_nor_its_random_numbers(env_id):
     rng = np.random.default_rng(2)
     while not plain.over[0]:
         plain.step(rng.integers(plain.n_actions, size=(1, plain.n_agents)))
-    saved, expected = drawn.save_state(), plain.save_state()
-    for name in expected:
-        np.testing.assert_array_equal(saved[name], expected[name], err_msg=name)
+    saved = drawn.save_state()
+    expected = plain.save_state()
+    assert [name for name in expected if saved[name] != expected[name]] == []
 
 
 PANEL = [("elapsed", 0, 40), ("episode_return", 0, 12.3), ("success", 0, True), ("over", 0, True)]
