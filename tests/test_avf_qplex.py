@@ -601,7 +601,7 @@ def test_same_seed_same_curve_and_seed_zero_counts(tmp_path, matrix_game):
     """A seed changes what is played and what is learned."""
     curves = []
     for run, seed in enumerate((0, 0, 1)):
-        short = {**TINY, "total_timesteps": 520, "learning_starts": 100, "train_frequency": 4, "batch_size": 2}
+        short = {**TINY, "total_timesteps": 1_020, "learning_starts": 100, "train_frequency": 4, "batch_size": 2}
         args = Args(env="matrix", seed=seed, runs_dir=f"{tmp_path}/{run}", **short)
         curves.append(scalars(avf_qplex.train(args)))
     assert curves[0] == curves[1]
