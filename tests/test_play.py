@@ -228,6 +228,15 @@ def test_rows_fit_a_terminal(env_id):
     assert max(map(len, lines)) <= 120 and not any(line.endswith("...") for line in lines)
 
 
+def test_rows_of_odd_names_fit_a_terminal():
+    script = importlib.import_module("avf_qplex")
+    recorder = scripted()
+    recorder.env.macro_action_names = [["", "-1", "A--B", "Wait-", "去工作室", "x" * 200, "-", "Stay"]] * 2
+    lines = play.describe_rows(script, script.Args(env="bp-10"), recorder, 0, 3)
+    assert max(map(len, lines)) == 120
+    assert [line.split("|")[1].split()[:3] for line in lines[5:7]] == [["0", "Stay", "0"], ["1", "-1", "0"]]
+
+
 # ---- the command line -----------------------------------------------------------------------------------------------
 def test_what_is_printed(run, brief, capsys, monkeypatch):
     script, asked = importlib.import_module("avf_qplex"), []
