@@ -30,7 +30,8 @@ from envs.warehouse import Warehouse
 
 SCRIPTS = ("avf_vdn", "avf_qmix", "avf_qplex", "dec_maddrqn", "cen_maddrqn", "mac_iaicc")
 COLUMNS = 120  # of the terminal in which rows are printed
-MOST_FRAMES = 500  # of an animation, which is held in memory; the tasks of envs/ need at most 151
+MOST_FRAMES = 301  # of an animation, which takes 1 MB each in memory; the tasks of envs/ need at most 151
+MOST_STEPS = 1_000  # of a timeline, which takes half a minute then
 MOST_EPISODES = 100_000  # that are played side by side
 
 
@@ -110,8 +111,7 @@ class Recorder:
 
     def step(self, actions):
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
-        is_first_episode = not self.steps or not self.steps[-1].over[0]
-        if is_first_episode:
+        if not self.steps or not self.steps[-1].over[0]:  # in the first episode
             before = self.seen
             self._look(obs, infos)
             over = terminations | truncations
@@ -359,8 +359,11 @@ def main(argv=None):
         fail(f"{args.env} cannot be played: {reason(error)}")
     episode = recorder.episode()
     length = len(episode.rewards)
-    if options.steps and options.steps[1] > length:
-        fail(f"--steps {options.steps[0]}-{options.steps[1]} is out of range: the episode has {length} steps")
+    first, last = options.steps or (0, length)
+    if last > length:
+        fail(f"--steps {first}-{last} is out of range: the episode has {length} steps")
+    if options.timeline and last - first > MOST_STEPS:
+        fail(f"--timeline can show {MOST_STEPS} steps, the episode has {length}: choose some with --steps")
     rows = []
     if options.rows:
         try:
@@ -384,10 +387,9 @@ def main(argv=None):
     if options.timeline:
         import timeline  # here, since it takes a while to import matplotlib
 
+        end = ", success" if result["success"][0] else ""
         facts = f"A greedy episode of {length} steps, {len(episode.rows())} of them rows: "
-        facts += f"return {result['return'][0]:.4g}"
-        if result["success"][0]:
-            facts += ", success"
+        facts += f"return {result['return'][0]:.4g}{end}"
         figure = timeline.draw(episode, f"{args.env}, {script.__name__}", facts, options.steps)
         kind = Path(options.timeline).suffix.lower().removeprefix(".")
         write(options.timeline, lambda file: timeline.save(figure, file, kind))

@@ -613,6 +613,15 @@ def test_a_long_animation_is_cut_and_play_says_so(run, tmp_path, brief, capsys, 
         assert animation.n_frames == 5
 
 
+def test_a_timeline_that_is_too_long_needs_steps(run, tmp_path, brief, monkeypatch):
+    monkeypatch.setattr(play, "MOST_STEPS", 11)
+    command = [str(run), "--episodes=1", f"--timeline={tmp_path / 'team.svg'}"]
+    with pytest.raises(SystemExit, match=r"^play: --timeline can show 11 steps, the episode has 12: choose some with"):
+        play.main(command)
+    assert not list(tmp_path.iterdir())
+    play.main([*command, "--steps=1-12"])
+
+
 @pytest.mark.parametrize("name", ["team.gif", "team.png", "team.svg", "team.pdf"])
 def test_a_full_disk_ends_with_one_line_and_leaves_nothing(run, tmp_path, brief, name):
     """Here files may have 1,000 bytes at most."""
