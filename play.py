@@ -255,7 +255,7 @@ def read_model(path):
             if archive.testzip():  # the name of a part whose checksum is wrong
                 raise zipfile.BadZipFile
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        return saved["algorithm"], dict(saved["args"]), saved["networks"], saved["step"]
+        return saved["algorithm"], dict(saved["args"]), saved["networks"], int(saved["step"])
     except OSError as error:
         fail(error)
     except Exception:  # of many classes; torch's words for some advise to load the file unsafely
@@ -274,7 +274,7 @@ def load_run(folder, name, env=None):
     script = importlib.import_module(algorithm)
     differing = settings.keys() ^ {field.name for field in dataclasses.fields(script.Args)}
     if differing:
-        fail(f"{path} is of another version of {algorithm}.py: it has not the same {' '.join(map(str, differing))}")
+        fail(f"{path} is of another version of {algorithm}.py: {sorted(map(str, differing))} differ")
     saved_env = str(settings["env"])
     if env is None and ":" in saved_env:
         fail(f"{path} names a module, which is imported only if you add --env {saved_env!r}")

@@ -478,8 +478,9 @@ def test_the_task_may_be_given_though_it_need_not(run, refused):
         ({"gamma": 1.5}, "does not fit its settings: .*--gamma must be from 0 to 1, got 1.5"),
         ({"gamma": float("nan")}, "does not fit its settings: .*--gamma must be"),
         ({"gamma": None}, "does not fit its settings: "),
-        ({"depth": 3}, "is of another version of avf_qplex.py: it has not the same depth"),
-        ({3: 3}, "is of another version of avf_qplex.py: it has not the same 3"),
+        ({"depth": 3}, "is of another version of avf_qplex.py: .'depth'. differ$"),
+        ({"\n": 3, "b": 4}, r"is of another version of avf_qplex.py: .'.n', 'b'. differ$"),
+        ({3: 3}, "is of another version of avf_qplex.py: .'3'. differ$"),
     ],
 )
 def test_edited_settings_end_with_one_line(edit, refused, settings, message):
@@ -492,7 +493,7 @@ def test_a_missing_setting_is_not_replaced_by_todays_default(run, tmp_path, refu
     for name in saved["args"]:
         others = {other: value for other, value in saved["args"].items() if other != name}
         torch.save({**saved, "args": others}, tmp_path / "best.pt")
-        refused(f"is of another version of avf_qplex.py: it has not the same {name}$")
+        refused(f"is of another version of avf_qplex.py: .'{name}'. differ$")
 
 
 def without(key, values):
