@@ -66,8 +66,9 @@ class MacroVectorEnv(VectorEnv, ABC):
         Raises:
             ValueError: an argument is out of range.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and not (isinstance(render_mode, str) and render_mode in modes):
+            raise ValueError(f"render_mode must be None or one of {modes}, got {checks.shown(render_mode)}")
         num_envs = checks.whole("num_envs", num_envs)
         self.num_envs = num_envs
         self.horizon = checks.whole("horizon", horizon)

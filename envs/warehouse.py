@@ -191,7 +191,8 @@ class Warehouse(MacroVectorEnv):
     - under_way bool [N, R], whether the robot was still short of its waypoint after the last step
     - waited int [N, R], for how many steps the robot has waited at the table. The count is set to 0 when a Pass serves
       the robot and in each step in which the robot is under way. It is set to 1 when a Get-Tool ends in vain, because
-      its last step also counts as the first one of a next wait.
+      its last step also counts as the first one of a next wait. In a layout of your own a robot can go elsewhere in one
+      step and come back in another one. It is never under way then, so the count stays.
     - carried int [N, R, 3], copies of each tool
     - staged int [N, C], queue of tools, oldest first, -1 for an empty place
     - found int [N, 3], copies of each tool found so far
@@ -258,8 +259,8 @@ class Warehouse(MacroVectorEnv):
         staging_capacity=2,
     ):
         """Raises ValueError: the layout is unknown, or an argument is out of range or does not fit the others."""
-        if layout not in list(LAYOUTS):  # a list: an argument without a hash would make a dict raise TypeError
-            raise ValueError(f"unknown layout {layout!r}; valid layouts: {' '.join(LAYOUTS)}")
+        if not isinstance(layout, str) or layout not in LAYOUTS:
+            raise ValueError(f"unknown layout {checks.shown(layout)}; valid layouts: {' '.join(LAYOUTS)}")
 
         self.layout = layout
         self.primitive = checks.flag("primitive", primitive)
