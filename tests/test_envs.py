@@ -510,6 +510,19 @@ def test_pushing_rules():
     assert env.box_y[0].tolist() == [9.5, 5.5, 5.5] and not infos["success"][0]
 
 
+def test_agent_1_goes_after_agent_0_has_pushed_and_not_the_other_way_round():
+    """One pushes small box 0 out of row 5.5. The other wants to go south through that row, where a cell is blocked."""
+    below_the_box, above_the_row = (1.5, 4.5), (4.5, 6.5)
+    for pusher, faces, place in ((0, 2, [4.5, 5.5]), (1, 1, [4.5, 6.5])):
+        starts = [below_the_box, above_the_row] if pusher == 0 else [above_the_row, below_the_box]
+        orientations = (0, 2) if pusher == 0 else (2, 0)
+        env = envs.make("bp-10", agent_starts=starts, agent_orientations=orientations)
+        env.reset(seed=0)
+        env.step(np.array([[4, 2]]) if pusher == 0 else np.array([[2, 4]]))
+        assert env.box_y[0, 0] == 6.5
+        assert env.position[0, 1 - pusher].tolist() == place and env.orientation[0, 1 - pusher] == faces
+
+
 def test_both_may_push_one_small_box_beyond_the_goal_row():
     """Agent 1 stands in the box's own cell, so that the box is in front of it after agent 0 has pushed it."""
     places = {"small_boxes": [(1.5, 8.5), (8.5, 5.5)], "agent_starts": [(1.5, 7.5), (1.5, 8.5)]}
