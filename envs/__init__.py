@@ -105,7 +105,7 @@ def problem(env_id):
         return str(error)
     try:
         env = domain(num_envs=1, **kwargs)
-        env.reset(seed=0)
+        env.reset()
         env.step(env.available.argmax(axis=2))
         env.close()
     except Exception as error:

@@ -441,9 +441,10 @@ class Warehouse(MacroVectorEnv):
         """Robots that have reached a workshop give its human the next tool; returns the rewards, float64 [N]."""
         visits = arrived[:, :, None] & one_hot(destination, self.n_humans)  # [N, R, H]
         needed = np.minimum(self.phase, TOOLS - 1)  # [N, H]: in phase p tool p is next; not used in the last phase
-        needs_now = one_hot(needed, TOOLS) & ~self.has_next_tool[:, :, None]  # [N, H, TOOLS]
-        carries = self.carried > 0  # [N, R, TOOLS]
-        brings = visits & (carries[:, :, None] & needs_now[:, None]).any(axis=3)  # [N, R, H]
+        env = np.arange(self.num_envs)[:, None, None]
+        robot = np.arange(self.n_robots)[:, None]
+        carries = self.carried[env, robot, needed[:, None]] > 0  # [N, R, H]
+        brings = visits & carries & ~self.has_next_tool[:, None]
         delivers = brings & (brings.cumsum(axis=1) == 1)  # if two bring a human the same tool, the first one gives it
         env, robot, human = np.nonzero(delivers)
         self.carried[env, robot, needed[env, human]] -= 1  # a robot visits one workshop, so no pair occurs twice
