@@ -63,7 +63,7 @@ def joint_tables(mixer, utilities, available, state, values=None):
     """The mixer's value of every joint action. Values of those that are not available mean nothing.
 
     Args:
-        mixer: called as the mixers of the scripts are, in float64.
+        mixer: called as the mixers of the scripts are, in float64. (All can be float32, too.)
         utilities: n float64 arrays [batch, |M^i|].
         available: n bool arrays [batch, |M^i|] or [|M^i|].
         state: float64 [batch, S].

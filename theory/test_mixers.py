@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 import avf_qmix
 import avf_qplex
 import envs
+from avf_qmix import QMIXMixer
 from avf_qplex import QPLEXMixer
 from theory.expressiveness import (
     CLASSES,
@@ -272,29 +273,35 @@ def test_epsilon_keeps_apart_what_utilities_keep_apart(what):
         assert mac_igm(q, utilities, available, "equal")
 
 
-def test_epsilon_is_lost_in_the_rounding_of_float32():
-    """In which the scripts train: where the network says 0 for the key, all that is open is worth the same."""
-    mixer = random_network(QPLEXMixer, (3, 3), np.random.default_rng(2))
-    last = mixer.state_net[-1]
-    last.weight[4 : 4 + mixer.heads] = 0.0
-    last.bias[4 : 4 + mixer.heads] = 0.0
-    utilities = torch.tensor([[2.0, 1.0, 0.0], [0.0, 1.0, 2.0]])
-    everything = torch.ones(2, 3, dtype=torch.bool)
-    worst, best = torch.tensor([2, 0]), torch.tensor([0, 2])
-    state = torch.ones(3)
-    difference = {}
-    for dtype in (torch.float64, torch.float32):
-        mixer = mixer.to(dtype)
-        of_best, of_worst = (mixer(utilities.to(dtype), m, everything, state.to(dtype)) for m in (best, worst))
-        difference[dtype] = (of_best - of_worst).item()
-    assert difference[torch.float64] > 1e-11
-    assert abs(difference[torch.float32]) < 1e-6
+@pytest.mark.parametrize(
+    ("what", "in_float64"),
+    [("key", True), ("w_i", True), ("agent_i", False)],
+)
+def test_epsilon_is_lost_in_the_rounding_of_float32(what, in_float64):
+    """In which the scripts train. A key or w_i of 0 makes all that is open worth the same: "equal" fails.
+
+    The sigmoid of agent_i = -1000 is 0 in both. All other numbers are small integers, so none of them is rounded.
+    """
+    utilities = own("2 1 0", "0 1 2")
+    everything = all_free((3, 3))
+    mixer = zeroed(QPLEXMixer(own_actions((3, 3)), 1))
+    outputs = {"w_i": slice(0, 2), "b_i": slice(2, 4), "key": slice(4, 8), "agent_i": slice(8, 16)}
+    bias = mixer.state_net[-1].bias
+    bias.fill_(1.0)
+    bias[outputs[what]] = -1000.0 if what == "agent_i" else 0.0
+    for dtype, holds in ((np.float64, in_float64), (np.float32, False)):
+        own_part = [u[None].astype(dtype) for u in utilities]
+        state = np.zeros((1, 1), dtype)
+        mixer = mixer.to(torch.from_numpy(state).dtype)
+        (q,) = joint_tables(mixer, own_part, everything, state)
+        verdicts = [mac_igm(q, utilities, everything, ties).holds for ties in TIES]
+        assert verdicts == [holds, True, True]
 
 
-@pytest.mark.parametrize("name", ["as shipped", "told available"])
+@every_consistent_mixer
 @of_many_sizes
-def test_conditioned_qplex_has_the_ties_of_its_utilities_and_no_others(name, sizes):
-    """Weights and lambdas of a network are positive, so "equal" holds: the equation as written.
+def test_has_the_ties_of_its_utilities_and_no_others(name, sizes):
+    """Weights of random networks are positive, so "equal" holds: the equation as written.
 
     Rounding is below the first tolerance and all differences are above the second: no value lies between them.
     """
@@ -302,11 +309,31 @@ def test_conditioned_qplex_has_the_ties_of_its_utilities_and_no_others(name, siz
     utilities = [np.round(u) for u in random_utilities(sizes, 300, rng)]
     available = random_available(sizes, 300, rng)
     state = rng.normal(size=(300, 3))
-    mixer = random_network(MIXERS[name], sizes, rng)
-    q = joint_tables(mixer, utilities, available, state)
+    values = np.round(rng.normal(size=len(sizes))) if name.endswith("dueling") else None
+    mixer = random_network(ALWAYS[name], sizes, rng)
+    q = joint_tables(mixer, utilities, available, state, values)
     scale = np.abs(q).reshape(300, -1).max(1)
     for tolerance in (1e-13, 1e-8):
         assert mac_igm_batch(q, utilities, available, "equal", tolerance * scale)[0].all()
+
+
+def test_qmix_is_equal_where_each_agent_has_a_unit_with_positive_weights():
+    """And only there: with other weights of 0 a utility moves nothing, and joint maximisers are not greedy."""
+    rng = np.random.default_rng(14)
+    utilities = own("1 0", "1 0")
+    found = set()
+    for _ in range(100):
+        mixer = zeroed(QMIXMixer(2, 1, embed=3))
+        weight_1 = rng.integers(2, size=(2, 3)).astype(float)
+        weight_2 = rng.integers(2, size=3).astype(float)
+        mixer.weight_1[-1].bias.copy_(torch.from_numpy(weight_1.ravel()))
+        mixer.weight_2[-1].bias.copy_(torch.from_numpy(weight_2))
+        q = one_table(mixer, utilities, all_free((2, 2)))
+        each_has_one = (weight_1 * weight_2 > 0).any(1).all()
+        verdicts = [mac_igm(q, utilities, all_free((2, 2)), ties).holds for ties in TIES]
+        assert verdicts == [each_has_one, True, True]
+        found.add(bool(each_has_one))
+    assert found == {True, False}
 
 
 @pytest.mark.parametrize("why", ["a weight is 0", "ELU is saturated"])
