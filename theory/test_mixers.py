@@ -469,6 +469,23 @@ def test_how_often_literal_qplex_breaks(sizes, busy_agents, make, low, high):
     assert low <= count / 2_000 <= high
 
 
+class Against(torch.nn.Module):
+    """A joint value that falls with the utility of one agent and sees no other."""
+
+    def __init__(self, agent):
+        super().__init__()
+        self.agent = agent
+
+    def forward(self, utilities, actions, available, state):
+        return -utilities.gather(-1, actions[..., None])[..., self.agent, 0]
+
+
+@pytest.mark.parametrize(("agent", "count"), [(0, 0), (1, 30), (2, 30)])
+def test_breaks_has_the_first_agents_busy_and_the_others_choose(agent, count):
+    """By hand, agent 1 busy: a value against what agent 1 does breaks nothing, one against another agent each time."""
+    assert breaks((3, 2, 4), 1, 30, 0, lambda own, state_size: Against(agent)) == count
+
+
 # ---- dueling heads --------------------------------------------------------------------------------------------------
 def test_free_signs_with_lambda_of_the_joint_action_break_igm_with_one_agent():
     """V = 0, A = (2, 1), lambda = (1, 3): Q = (2, 3). With V = max and the same lambda: Q = (2, -1)."""
