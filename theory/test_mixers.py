@@ -55,6 +55,8 @@ ALWAYS = {  # what satisfies Mac-IGM at any weights
     "VDN": MIXERS["VDN"],
     "QMIX": MIXERS["QMIX"],
     "as shipped": MIXERS["as shipped"],
+    "b told": MIXERS["b told"],
+    "lambda told": MIXERS["lambda told"],
     "told available": MIXERS["told available"],
     "lambda(s), literal": literal_with_lambda_of_state,
     "lambda(s), dueling": dueling_with_lambda_of_state,
@@ -568,6 +570,24 @@ def test_qplex_told_what_is_available_represents_every_mac_igm_family(family):
             assert abs(q[m] - table[m]) <= 1e-7 * size
 
 
+def test_the_revisions_lambda_loses_a_part_where_not_all_agents_deviate():
+    """Its proof (Appendix B) charges each of n agents a share 1/n of the loss, which those with A_i = 0 do not carry.
+
+    By hand, V = 4, so at (b, a) agent 1 alone carries 1/2 of the loss of 1. Shared among those who deviate it is right.
+    """
+    q = matrix("4 3", "3 0")
+    utilities = [u[None] for u in own("1 0", "1 0")]
+    advantage = matrix("0 0", "-1 -1"), matrix("0 -1", "0 -1")  # A_1, A_2 by [m_1, m_2]
+    deviators = sum(a < 0 for a in advantage)
+    for shares, expected in ((2, ["4 3.5", "3.5 0"]), (np.maximum(deviators, 1), ["4 3", "3 0"])):
+        lambdas = []
+        for a in advantage:
+            own_loss = np.where(a < 0, a, 1.0)
+            lambdas.append(np.where(a < 0, (q - 4) / shares / own_loss, 1.0))
+        made = 4 + duplex_tables(utilities, np.stack(lambdas)[None])
+        assert close(made[0], *expected)
+
+
 @pytest.mark.parametrize("name", CLASSES)
 def test_networks_lie_in_the_class_stated_for_them(name):
     """The cones that `residuals` measures against contain what the mixers compute, in all situations together."""
@@ -590,33 +610,44 @@ def test_networks_lie_in_the_class_stated_for_them(name):
 
 @pytest.mark.parametrize("sizes", [(2, 2), (3, 3), (2, 3, 2)], ids=str)
 def test_as_shipped_only_additive_tables_serve_all_situations(sizes):
-    """The tables that are the same in every situation: as shipped the additive ones, 1 + sum_i (|M^i| - 1)."""
+    """The tables that are the same in every situation: as shipped the additive ones, 1 + sum_i (|M^i| - 1).
+
+    So it is if the b_i see the situation. If the lambda_i see it, a table is additive where some agent is greedy, and
+    free elsewhere, which 2 agents can make up for by their utilities.
+    """
     joint_actions = list(np.ndindex(*sizes))
     one_table = np.array([[m == joint for joint in joint_actions] for _, m in rows(sizes)], float)
     order = [tuple(range(size))[::-1] for size in sizes]
     columns = {}
     dimension = {}
-    for name in ("VDN", "literal", "as shipped", "told available"):
+    for name in ("VDN", "literal", "as shipped", "b told", "lambda told", "told available"):
         columns[name], _ = cone(name, sizes, order)
         together = np.hstack([columns[name], one_table])
         ranks = [np.linalg.matrix_rank(x) for x in (columns[name], one_table, together)]
         dimension[name] = ranks[0] + ranks[1] - ranks[2]  # of the intersection
     additive = 1 + sum(sizes) - len(sizes)
     everything = np.prod(sizes)
+    nobody_greedy = np.prod([size - 1 for size in sizes])
     assert dimension == {
         "VDN": additive,
         "literal": everything,
         "as shipped": additive,
+        "b told": additive,
+        "lambda told": additive + nobody_greedy,
         "told available": everything,
     }
+    assert (additive + nobody_greedy == everything) == (len(sizes) == 2)
     assert np.linalg.matrix_rank(columns["VDN"]) == additive
     both = np.hstack([columns["VDN"], columns["as shipped"]])
     assert np.linalg.matrix_rank(both) == np.linalg.matrix_rank(columns["as shipped"])
 
 
-@pytest.mark.parametrize("name", ["as shipped", "told available"])
+@pytest.mark.parametrize("name", ["as shipped", "b told", "lambda told", "told available"])
 def test_as_shipped_a_situations_value_is_additive_in_m_minus(name):
-    """Agent 1 chooses, 2 and 3 go on. The best value for each m^- = (x, y), as shipped: v00 + v11 = v01 + v10."""
+    """Agent 1 chooses, 2 and 3 go on. The best value for each m^- = (x, y), as shipped: v00 + v11 = v01 + v10.
+
+    Only b_i (or w_i) that sees m^- changes that, not lambda_i.
+    """
     rng = np.random.default_rng(7)
     sizes = (3, 2, 2)
     mixer = random_network(MIXERS[name], sizes, rng, 2.0)
@@ -628,7 +659,7 @@ def test_as_shipped_a_situations_value_is_additive_in_m_minus(name):
         q = joint_tables(mixer, utilities, available, state)
         v[:, x, y] = q[:, :, x, y].max(1)
     found = np.abs(interaction(v)) / np.abs(v).max()
-    if name == "as shipped":
+    if name in ("as shipped", "lambda told"):
         assert found.max() < 1e-12
     else:
         assert np.median(found) > 1e-3
@@ -644,8 +675,14 @@ def one_head_told(own_actions, state_size):
 
 @pytest.mark.parametrize(
     ("make", "state_tells", "is_free"),
-    [(QPLEXMixer, False, False), (one_head, True, True), (one_head_told, False, True)],
-    ids=["as shipped", "as shipped, who is free in s", "told available"],
+    [
+        (QPLEXMixer, False, False),
+        (one_head, True, True),
+        (MIXERS["b told"], False, False),
+        (MIXERS["lambda told"], False, True),
+        (one_head_told, False, True),
+    ],
+    ids=["as shipped", "as shipped, who is free in s", "b told", "lambda told", "told available"],
 )
 def test_weights_that_do_not_see_the_situation_tie_situations_together(make, state_tells, is_free):
     """Agent 1 deviates alone, agent 2 greedy or going on with it: as shipped its losses keep their proportions.
@@ -708,7 +745,7 @@ def families():
 
 REPRESENTED = {  # by which classes
     "additive": set(CLASSES),
-    "one table": {"literal", "told available"},
+    "one table": {"literal", "lambda told", "told available"},  # lambda told: of 2 agents
     "a table each": {"told available"},
 }
 
@@ -718,9 +755,14 @@ WIDER = [  # pairs of classes of which the second contains the first
     ("VDN", "as shipped"),
     ("QMIX", "monotone"),
     ("monotone", "literal"),
+    ("as shipped", "b told"),
+    ("as shipped", "lambda told"),
+    ("b told", "told available"),
+    ("lambda told", "told available"),
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FAMILIES)
 def test_classes_side_by_side(kind, families):
     error = {}
@@ -734,6 +776,7 @@ def test_classes_side_by_side(kind, families):
         assert (error[narrow] >= error[wide] - 1e-4).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind"),
     [("told available", "one table"), ("told available", "a table each"), ("as shipped", "one table")],

@@ -268,6 +268,30 @@ def test_histories_matter_if_policies_use_them(shows):
     assert determines(process, "joint") == (NEVER if shows == "trips" else WITH_HISTORIES)
 
 
+# ---- a macro-action that ends by chance -----------------------------------------------------------------------------
+def test_the_joint_macro_history_tells_who_is_free_only_without_chance():
+    """Eq. 6 has M^+ as a function of macro-histories. It is one where terminations are certain, and not by chance.
+
+    By hand: the first trip is made by hand, and the keeper has tidied. If this took 2 steps both choose now. If it took
+    1, the keeper has begun something else and goes on. So one joint macro-history has two sets M^+. The next trip by
+    cart, while the keeper tidies, is worth 7/8 with the first and 3/4 with the second.
+    """
+    together = (True, True)
+    carrier_alone = (True, False)
+    values = {}  # by joint macro-history, then by who chose
+    for row in delivery("position").rows:
+        value = delivery("position").value(row)
+        values.setdefault(row.histories, {}).setdefault(row.chosen, {})[row.macros] = value
+    of_one = values[(("hand", False),), (("tidy",),)]
+    assert set(of_one) == {together, carrier_alone}
+    assert of_one[together]["cart", "tidy"] == Fraction(7, 8)
+    assert of_one[carrier_alone]["cart", "tidy"] == Fraction(3, 4)
+    certain = {}
+    for row in delivery("position", False).rows:
+        certain.setdefault(row.histories, set()).add(row.chosen)
+    assert all(len(chosen) == 1 for chosen in certain.values())
+
+
 # ---- the real state -------------------------------------------------------------------------------------------------
 def return_explained(process, name, view_name):
     """Second moment of E[return | input]: the higher, the better the input predicts the return."""
