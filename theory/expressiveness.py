@@ -10,7 +10,9 @@ situation. A situation says what is available to each agent. Names, besides thos
 `python -m theory.expressiveness` prints the tables of README.md.
 """
 
+import argparse
 import itertools
+import sys
 from functools import cache
 
 import numpy as np
@@ -465,7 +467,10 @@ def fire(layer, unit, own, available, m=None):
 
 
 # ---- the tables of README.md ----------------------------------------------------------------------------------------
-def main():
+def main(argv=None):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.error = lambda message: sys.exit(f"expressiveness: {message}")
+    parser.parse_args(argv)  # there are no options but --help
     torch.set_num_threads(1)
     print("Mac-IGM violations in 2,000 random situations: lambda free / literal at initialisation / as shipped")
     for agents, size in itertools.product((2, 3, 4), (2, 3, 5)):
