@@ -21,7 +21,7 @@ Numbered deviations from the paper:
     the paper. The paper takes the best of all macro-actions (--no-mask-ongoing). A busy agent can have A_i < 0 then,
     weighted by lambda_i(s, m), which depends on the others' choices. Greedy agents may miss the team's best choice,
     which breaks Mac-IGM (theory/README.md).
- 2. A_i is Q_i - max Q_i <= 0 (Eq. 4). A dueling head (Def. 3.3) lets A_i be positive, which breaks Mac-IGM, too.
+ 2. A_i is Q_i - max Q_i <= 0 (Eq. 4). With a dueling head (Def. 3.3 allows A_i > 0) this mixer would break Mac-IGM.
  3. The mixer is two networks with 128 hidden units, of s and of (s, m), not a small one for each head and purpose.
  4. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
  5. Whole episodes are replayed, drawn with replacement, not windows of 25 rows. Targets are Q(lambda) returns. Negative
@@ -206,7 +206,7 @@ class QPLEXMixer(nn.Module):
     reached at its best choice. own_actions: bool [n, A], which macro-actions each agent has.
     """
 
-    def __init__(self, own_actions, state_size, hidden=128, heads=4, mask_ongoing=True):
+    def __init__(self, own_actions, state_size, mask_ongoing=True, hidden=128, heads=4):
         super().__init__()
         self.register_buffer("own_actions", own_actions, persistent=False)
         self.heads = heads
@@ -427,7 +427,7 @@ def make_learner(args, env):
     """The agents' networks and the mixer, as one module on the device."""
     agents = Agents(env.n_agents, max(env.n_actions), max(env.obs_sizes), args.hidden_size, args.obs_scale)
     state_size = env.state_size * env.n_agents if args.mixer_state == "joint" else env.state_size
-    mixer = QPLEXMixer(torch.from_numpy(env.own_actions), state_size, mask_ongoing=args.mask_ongoing)
+    mixer = QPLEXMixer(torch.from_numpy(env.own_actions), state_size, args.mask_ongoing)
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device)
 
 
@@ -613,7 +613,7 @@ if __name__ == "__main__":
     args = parse_args()
     try:
         train(args)
-    except (OSError, MemoryError) as error:  # a folder that cannot be written, too many episodes
+    except (OSError, envs.TaskError) as error:  # a folder that cannot be written, a task that goes wrong
         raise SystemExit(error) from None
     except KeyboardInterrupt:
         print("stopped; --resume with its folder goes on from its last checkpoint", file=sys.stderr)

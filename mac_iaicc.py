@@ -586,7 +586,7 @@ if __name__ == "__main__":
     args = parse_args()
     try:
         train(args)
-    except (OSError, MemoryError) as error:  # a folder that cannot be written, too many episodes
+    except (OSError, envs.TaskError) as error:  # a folder that cannot be written, a task that goes wrong
         raise SystemExit(error) from None
     except KeyboardInterrupt:
         print("stopped; --resume with its folder goes on from its last checkpoint", file=sys.stderr)

@@ -16,7 +16,7 @@ import gymnasium as gym
 
 from envs.box_pushing import BoxPushing
 from envs.capture_target import CaptureTarget
-from envs.core import MacroVectorEnv, SingleMacroEnv
+from envs.core import MacroVectorEnv, SingleMacroEnv, TaskError  # noqa: F401, the scripts need TaskError
 from envs.warehouse import Warehouse
 
 _TASKS = {}  # id: (domain, its keywords, default settings of the scripts)

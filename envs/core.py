@@ -11,6 +11,10 @@ from gymnasium.vector.utils import batch_space
 from envs import checks
 
 
+class TaskError(ValueError):
+    """What a domain says of its task cannot be: another shape, a number that is not finite, an empty initiation set."""
+
+
 class MacroVectorEnv(VectorEnv, ABC):
     """A batch of cooperative environments whose agents run macro-actions of different lengths.
 
@@ -152,8 +156,8 @@ class MacroVectorEnv(VectorEnv, ABC):
             obs float32 [N, n, d] and infos: those of `step`. `macro_action` is -1 in the environments that were reset.
 
         Raises:
-            ValueError: the mask has another shape or dtype, there is another option, or the domain's observations or
-                states are not what they must be.
+            ValueError: the mask has another shape or dtype, or there is another option.
+            TaskError: the domain's observations or states are not what they must be.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -193,9 +197,9 @@ class MacroVectorEnv(VectorEnv, ABC):
             - `success` bool [N]: whether the task's goal was reached in this step
 
         Raises:
-            ValueError: the array has another shape or is not of integers, an environment's episode has ended, a free
-                agent's macro-action is out of range or not in its initiation set, or what the domain returns is not
-                what it must be.
+            ValueError: the array has another shape or is not of integers, an environment's episode has ended, or a free
+                agent's macro-action is out of range or not in its initiation set.
+            TaskError: what the domain returns is not what it must be.
         """
         actions = np.asarray(actions)
         if actions.shape != self.macro_done.shape or actions.dtype.kind not in "iu":
@@ -260,7 +264,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.available = np.where(self.macro_done[:, :, None], self._initiation_sets(), is_running)
 
     def _initiation_sets(self):
-        """What `_can_start` returns, within what agents have. Raises ValueError if a free agent can start nothing."""
+        """What `_can_start` returns, within what agents have. Raises TaskError if a free agent can start nothing."""
         can_start = self._can_start()
         if can_start is self._own_everywhere:
             return can_start  # the default needs no check
@@ -270,21 +274,21 @@ class MacroVectorEnv(VectorEnv, ABC):
         is_stuck = is_empty & self.macro_done & ~self.over[:, None]
         if is_stuck.any():
             env, agent = np.argwhere(is_stuck)[0]
-            raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
+            raise TaskError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
         # Nobody chooses in an episode that is over. An empty set is filled there, so that one can mask with it.
         return can_start | (is_empty[:, :, None] & self.own_actions)
 
     def _checked(self, name, array, dtype, shape):
-        """Returns an array of the domain's. Raises ValueError if it is not of this dtype and shape, or not finite."""
+        """Returns an array of the domain's. Raises TaskError if it is not of this dtype and shape, or not finite."""
         domain = type(self).__name__
         if not isinstance(array, np.ndarray) or array.dtype != dtype or array.shape != shape:
             got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-            raise ValueError(f"{domain}.{name} must be {np.dtype(dtype)} {shape}, got {got}")
+            raise TaskError(f"{domain}.{name} must be {np.dtype(dtype)} {shape}, got {got}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             index = tuple(np.argwhere(~np.isfinite(array))[0])
             agent = f"agent {index[1]} of " if array.ndim == 3 else ""
             where = f"{agent}environment {index[0]} at step {self.elapsed[index[0]]}"
-            raise ValueError(f"{domain}.{name} must be finite, got {array[index]} for {where}")
+            raise TaskError(f"{domain}.{name} must be finite, got {array[index]} for {where}")
         return array
 
     def _infos(self):

@@ -657,7 +657,7 @@ def test_no_file_decides_which_module_is_imported(tmp_path, monkeypatch):
         code, said = run_as_program(monkeypatch, f"--resume={folder}", *more)
         assert code == 1 and one_line(said) and "a task of your own has to be: --env module:id" in said
     code, said = run_as_program(monkeypatch, f"--resume={folder}", "--env=my_task:mine")
-    assert said == "it was imported"
+    assert said == "--env: SystemExit: it was imported (in the import of 'my_task')"
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -681,6 +681,37 @@ def test_a_gradient_that_is_not_finite_ends_the_run(tmp_path, monkeypatch, scrip
     (folder,) = tmp_path.iterdir()
     for name in ("last.pt", "best.pt"):
         assert all(value.isfinite().all() for value in module.load(folder / name)["networks"].values())
+
+
+SPOILED = """
+import envs
+from envs.box_pushing import BoxPushing
+
+
+class Spoiled(BoxPushing):
+    def _advance(self):
+        rewards, terminations, ended, success = super()._advance()
+        if self.num_envs > 1 and self.elapsed[1] == 7:  # not in evaluations
+            rewards[1] = float("nan")
+        return rewards, terminations, ended, success
+
+
+envs.register("spoiled", Spoiled, grid=6)
+"""
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_task_of_the_current_folder_that_goes_wrong_ends_the_run_in_one_line(tmp_path, monkeypatch, script):
+    """The module is found there. The line names the environment and the step, and the last good model is kept."""
+    (tmp_path / "spoiled_task.py").write_text(SPOILED)
+    monkeypatch.chdir(tmp_path)
+    module = importlib.import_module(script)
+    options = {**SHORT, **(REPLAY if "buffer_size" in vars(module.Args) else {}), "eval_frequency": 12}
+    arguments = flags({**options, "env": "spoiled_task:spoiled", "eval_episodes": 1})
+    code, said = run_as_program(monkeypatch, *arguments, script=script)
+    assert (code, said) == (1, "Spoiled._advance: rewards must be finite, got nan for environment 1 at step 7")
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert module.load(folder / "last.pt")["step"] == 24
 
 
 def test_a_task_carries_its_values(tmp_path, monkeypatch):
