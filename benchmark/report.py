@@ -57,33 +57,51 @@ def with_interval(statistic, samples, digits):
     return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
+def check(run, evaluations):
+    """The numbers of a run that can be shown, a DataFrame; raises ValueError for any other, with the reason."""
+    if not all(isinstance(run[name], str) for name in (*record.KEY, "variant", "commit", "date")):
+        raise ValueError("its description is not of text")
+    numbers = evaluations[["step", *record.VALUES]].apply(pd.to_numeric, errors="coerce").astype(float)
+    if not np.isfinite(numbers).all(axis=None):
+        raise ValueError("an evaluation has a number missing, or something that is no finite number")
+    if f"{numbers['step'].max():.0f}" != run["steps"]:
+        raise ValueError(f"its evaluations do not go up to step {run['steps']}: cut short")
+    return numbers
+
+
 def read_runs(paths):
     """Two DataFrames, runs and evaluations (`run` is the index of the first), and notes on runs that are left out.
 
     The columns of VALUES are a run's final performance; `scaled` is 0 for the random policy and 1 for the scripted.
     """
-    found, notes = [], []
+    found, kept, notes = [], [], []
     for path in map(Path, paths):
         try:
-            found += record.load_runs(path.resolve(strict=True))
+            kept += record.load_runs(path.resolve(strict=True))
         except (OSError, ValueError) as error:
             sys.exit(f"report: cannot read {path}: {error}")
         for folder in sorted(file.parent for file in path.rglob("args.json")):
             try:
                 if not record.is_finished(folder):
                     raise ValueError("not finished")
-                found.append(record.read_folder(folder))
-            except (OSError, ValueError, KeyError, TypeError, ImportError, SystemExit) as error:
+                run, evaluations = record.read_folder(folder)
+                found.append((run, check(run, evaluations)))
+            except (OSError, ValueError, KeyError, TypeError, SystemExit) as error:
                 notes.append(f"{folder.name}: left out, {error}")
+    for run, evaluations in kept:
+        try:
+            found.append((run, check(run, evaluations)))
+        except ValueError as error:
+            notes.append(f"{run['algorithm']} on {run['env']}, seed {run['seed']}: left out, {error}")
     if not found:
         sys.exit("report: no finished run found")
-    runs = pd.DataFrame([run for run, _ in found]).astype({"seconds": float})
+    runs = pd.DataFrame([run for run, _ in found])
     evaluations = pd.concat([values.assign(run=i) for i, (_, values) in enumerate(found)])
-    evaluations = evaluations[["run", "step", *record.VALUES]].apply(pd.to_numeric)
     last = evaluations.sort_values("step").groupby("run").tail(LAST).groupby("run")
     runs = runs.join(last[record.VALUES].mean().round(6)).join(last["step"].max())  # rounded: ties stay ties
     for column, kind in (("floor", "random"), ("ceiling", "scripted")):
-        runs[column] = [REFERENCES[env][kind]["return"] for env in runs["env"]]
+        returns = {env: reference[kind]["return"] for env, reference in REFERENCES.items()}
+        runs[column] = runs["env"].map(returns)  # nan for a task of one's own
     runs["scaled"] = (runs["return"] - runs["floor"]) / (runs["ceiling"] - runs["floor"])
     runs["solved"] = last["return"].min() >= SOLVED * runs["ceiling"]
     same = ["env", "algorithm", "variant", "seed"]
@@ -134,7 +152,7 @@ def plot(path, widths, panels, evaluations, shares):
         legend |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     columns = max(1, int(11 * figure.get_figwidth()) // (max(map(len, legend)) + 9))  # as many as fit side by side
     figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns)
-    figure.savefig(path)
+    record.replace(path, lambda new: figure.savefig(new, format="png"))
     plt.close(figure)
 
 
@@ -144,22 +162,25 @@ def draw(ax, runs, evaluations, styles, shares=False):
     shares: against the share of the run, for runs of different lengths that take the same time.
     """
     groups = runs.groupby("label", sort=False)
-    floor, ceiling = runs[["floor", "ceiling"]].iloc[0]
+    floor, ceiling = runs[["floor", "ceiling"]].iloc[0]  # nan for a task of one's own
     lowest = floor - (ceiling - floor) / 2  # early curves may go far down; a band is not drawn without its curve
     for i, (label, of) in enumerate(groups):
         curves = evaluations[evaluations["run"].isin(of.index)].pivot(index="run", columns="step", values="return")
         middle, error = curves.dropna(axis=1).mean(), curves.dropna(axis=1).sem()
+        if middle.empty:  # no two of these runs were evaluated at the same steps
+            continue
         x = middle.index / (middle.index[-1] / 100 if shares else 1000)
         every = max(1, len(middle) // 8)
         colour, marker = styles[label]
         marks = dict(marker=marker, ms=4.5, markevery=(i * every // len(groups), every))
-        band = dict(where=middle >= lowest, color=colour, alpha=0.15, lw=0, zorder=2)
+        band = dict(where=~(middle < lowest), color=colour, alpha=0.15, lw=0, zorder=2)
         ax.fill_between(x, middle - error, middle + error, **band)
         ax.plot(x, middle, color=colour, lw=1.7, label=label, zorder=3 + len(groups) - i, **marks)
     for level, line, label in ((floor, ":", "random policy"), (ceiling, "--", "scripted policy")):
-        ax.axhline(level, color="#444444", lw=1.2, ls=line, label=label, zorder=1)
-    bottom = max(ax.get_ylim()[0], lowest)
-    top = max(np.max(line.get_ydata()) for line in ax.lines)
+        if np.isfinite(level):
+            ax.axhline(level, color="#444444", lw=1.2, ls=line, label=label, zorder=1)
+    bottom = np.fmax(ax.get_ylim()[0], lowest)
+    top = max((np.max(line.get_ydata()) for line in ax.lines), default=bottom + 1)
     ax.set_ylim(bottom, top + 0.05 * (top - bottom))
     usual = runs[runs["variant"] == ""]  # a variant may go on for longer
     ax.set_xlim(0, 100 if shares else (usual if len(usual) else runs)["step"].max() / 1000)
@@ -176,9 +197,11 @@ def table(rows):
 
 def samples(panels, column):
     """{label: [the runs' values in each panel]} of the labels that have runs in all panels."""
-    runs = pd.concat(panels, names=["panel"])
-    values = runs.groupby(["label", "panel"], sort=False)[column].agg(np.array).unstack().dropna()
-    return {label: list(values.loc[label]) for label in runs["label"].unique() if label in values.index}
+    found = {}
+    for runs in panels.values():
+        for label, values in runs.groupby("label", sort=False)[column]:
+            found.setdefault(label, []).append(values.to_numpy())
+    return {label: values for label, values in found.items() if len(values) == len(panels)}
 
 
 def tables(panels, paper):
@@ -186,7 +209,8 @@ def tables(panels, paper):
     rows, pairs = [], {}
     for panel, runs in panels.items():
         env = runs["env"].iloc[0]
-        digits, optimal = 3 if env.startswith("ct") else 1, REFERENCES[env]["scripted"]["optimal"]
+        digits = 1 if env.startswith(("bp", "wtd")) else 3
+        optimal = env in REFERENCES and REFERENCES[env]["scripted"]["optimal"]
         for label, of in runs.groupby("label", sort=False):
             k, n = of["solved"].sum(), len(of)
             low, high = stats.binomtest(k, n).proportion_ci(method="exact")
@@ -195,8 +219,9 @@ def tables(panels, paper):
                 row[column] = f"{x.mean():.{digits}f} ± {x.sem():.{digits}f}".removesuffix(" ± nan")
             row["IQM [95%]"] = with_interval(iqm, [of["return"].to_numpy()], digits)
             row["solved [95%]"] = f"{k} of {n} [{low:.2f}, {high:.2f}]" if optimal else "no optimum known"
-            row |= {kind: f"{of[kind].iloc[0]:.{digits}f}" for kind in ("floor", "ceiling")}
-            rows.append(row | {"steps": f"{of['step'].max():,}", "time": f"{of['seconds'].mean() / 60:.1f} min"})
+            known = {kind: of[kind].iloc[0] for kind in ("floor", "ceiling") if env in REFERENCES}
+            row |= {kind: f"{value:.{digits}f}" for kind, value in known.items()}
+            rows.append(row | {"steps": f"{of['step'].max():,.0f}"})
     columns = {panel: {panel: runs} for panel, runs in panels.items()}
     if len(panels) > 1:
         columns["all"] = panels
@@ -212,15 +237,17 @@ def tables(panels, paper):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="*", default=[record.RESULTS], metavar="RUNS", help="default: benchmark/results")
-    parser.add_argument("-o", "--output", type=Path, default=record.RESULTS, help="folder (default: benchmark/results)")
+    parser.error = lambda message: sys.exit(f"report: {message}")
+    add, results = parser.add_argument, record.RESULTS
+    add("runs", nargs="*", default=[results], metavar="RUNS", help="default: benchmark/results")
+    add("-o", "--output", type=record.folder, default=results, help="folder (default: benchmark/results)")
     args = parser.parse_args(argv)
-    runs, evaluations, notes = read_runs(args.runs)
-    for note in notes:
-        print(f"report: {note}", file=sys.stderr)
-    shown, missing, text = set(), [], ""
     try:
-        args.output.mkdir(parents=True, exist_ok=True)
+        record.make_folder(args.output)
+        runs, evaluations, notes = read_runs(args.runs)
+        for note in notes:
+            record.tell(f"report: {note}")
+        shown, missing, text = set(), [], ""
         for title, section in PAPER["sections"].items():
             rest = list(runs.drop(shown)["env"].unique())  # tasks of runs that no section before has shown
             rows = section["panels"] or [rest[i : i + 4] for i in range(0, len(rest), 4)]
@@ -241,9 +268,9 @@ def main(argv=None):
         values = dict(sections=text, missing="; ".join(missing) or "none", sources=table(sources.to_dict("records")))
         values |= dict(notes="".join(f"- {note}\n" for note in notes), last=LAST, solved=SOLVED, resamples=RESAMPLES)
         text = (HERE / "report.md").read_text().format(**values).strip()
-        (args.output / "README.md").write_text(f"{text}\n")
+        record.replace_text(args.output / "README.md", f"{text}\n")
     except OSError as error:
-        sys.exit(f"report: cannot write to {args.output}: {error.strerror}")
+        sys.exit(f"report: cannot write to {args.output}: {error.strerror or error}")
     print(args.output / "README.md")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
@@ -147,7 +148,7 @@ def test_a_report_by_hand(runs, tmp_path, capsys):
     assert rows(figure_4, "wtd-s", "AVF-QPLEX") == [{
         "task": "wtd-s", "": "AVF-QPLEX", "runs": "3", "return: mean ± SE": "30.7 ± 15.9", "discounted": "15.3 ± 8.0",
         "IQM [95%]": "30.7 [10.0, 62.0]", "solved [95%]": "1 of 3 [0.01, 0.91]", "floor": "-40.0", "ceiling": "60.0",
-        "steps": "600,000", "time": "6.0 min",
+        "steps": "600,000",
     }]  # fmt: skip
     assert rows(figure_4, "wtd-s", "AVF-QMIX")[0]["solved [95%]"] == "0 of 3 [0.00, 0.71]"
     # against 20, 5, 60: 10 wins once, 20 wins once and ties once, 62 wins three times: 5.5 of 9 pairs
@@ -216,7 +217,8 @@ def test_the_grid_has_the_runs_of_every_panel():
         given = {name: values for name, *values in (part.split() for part in own.split("--")[1:])}
         for algorithm, env in itertools.product(given["algos"], given["envs"]):
             args = vars(record.load_script(algorithm).parse_args([f"--env={env}", *flags.split()]))
-            grid.add((env, algorithm, *given.get("variant", [record.flags_of(algorithm, args)])))
+            flags_now = record.flags_of(record.values_of(algorithm, env), args)
+            grid.add((env, algorithm, *given.get("variant", [flags_now])))
     compared = {("bp-30", "mac_iaicc", "same-time"), ("wtd-t1", "mac_iaicc", "same-time")}
     compared |= {("wtd-t1", "mac_iaicc", "same-time-8")}
     for panels in report.PAPER["sections"].values():
@@ -317,7 +319,101 @@ def test_over_all_tasks(tmp_path):
     assert (pair["wtd-s"], pair.get("all", "")) == ("1.00", "")
 
 
+def write_kept(place, seed, **changed):
+    """A run as the sweep records it, with changed cells: of runs.csv or, under a VALUES name, of one evaluation."""
+    key = {"algorithm": "avf_qplex", "env": "wtd-s", "flags": "", "seed": str(seed), "checksum": "c"}
+    run = dict.fromkeys(record.RUNS, "") | key | {"steps": "600000"} | changed
+    rows = [{**run, "step": str(step), **dict.fromkeys(record.VALUES, "10")} for step in STEPS]
+    rows[2] |= {name: changed[name] for name in changed if name in record.VALUES}
+    record.add(place, run, pd.DataFrame(rows)[record.TABLES["evaluations.csv"]])
+
+
+def test_a_bad_recorded_run_does_not_take_the_others_down(tmp_path):
+    kept = tmp_path / "kept"
+    write_kept(kept, 1)
+    write_kept(kept, 2, **{"return": "nan"})
+    write_kept(kept, 3, length="long")
+    write_kept(kept, 4, success="")
+    write_kept(kept, 5, steps="700000")
+    write_kept(kept, 6, steps="many")
+    write_kept(kept, 7, discounted_return="inf")
+    write_kept(kept, 8)
+    lines = (kept / "evaluations.csv").read_text().splitlines(keepends=True)
+    (kept / "evaluations.csv").write_text("".join(lines[:-6]))  # that of seed 8 is gone
+    text = make(tmp_path, kept)
+    assert rows(text, "wtd-s", "AVF-QPLEX")[0]["runs"] == "1"
+    notes = [line for line in text.splitlines() if line.startswith("- ")]
+    starts = [f"- avf_qplex on wtd-s, seed {seed}: left out, " for seed in range(2, 9)]
+    assert [note[: len(start)] for note, start in zip(notes, starts, strict=True)] == starts
+    assert [note.endswith("no finite number") for note in notes] == [True, True, True, False, False, True, False]
+    assert notes[3].endswith("its evaluations do not go up to step 700000: cut short")
+
+
+def test_a_bad_run_folder_does_not_take_the_others_down(tmp_path):
+    write_run(tmp_path / "runs", "avf_qplex", "wtd-s", 1, rising(10))
+    write_run(tmp_path / "runs", "avf_qplex", "wtd-s", 2, rising(float("nan")))
+    write_run(tmp_path / "runs", "avf_qplex", "wtd-s", 3, rising(10), total_timesteps="many")
+    origin = write_run(tmp_path / "runs" / "more", "avf_qplex", "wtd-s", 4, rising(10)).parent / record.ORIGIN
+    origin.write_text('{"flags": 5, "checksum": null}')
+    text = make(tmp_path, tmp_path / "runs")
+    assert rows(text, "wtd-s", "AVF-QPLEX")[0]["runs"] == "1"
+    assert sum(line.startswith("- wtd-s__avf_qplex__") for line in text.splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda text: text.replace("\n", "\n<<<<<<< HEAD\n", 1), "line 2 of runs.csv is no row of 11 columns: <<<<<<<"),
+        (lambda text: text + "=======\n", "line 3 of runs.csv is no row of 11 columns: ======="),
+        (lambda text: text.replace("\n", ",mine\n"), "runs.csv must begin with the columns algorithm,env,variant,"),
+        (lambda text: text.replace("steps,", "", 1), "runs.csv must begin with the columns"),
+        (lambda text: "", "runs.csv must begin with the columns"),
+        (lambda text: text + '"', "runs.csv: unexpected end of data"),
+        (lambda text: text[:-5], "line 2 of runs.csv is no row of 11 columns: avf_qplex,wtd-s,,1,"),
+    ],
+)
+def test_tables_that_were_spoilt_are_refused_and_stay(tmp_path, change, message):
+    write_kept(tmp_path / "kept", 1)
+    path = tmp_path / "kept" / "runs.csv"
+    path.write_text(change(path.read_text()))
+    before = path.read_text()
+    with pytest.raises(SystemExit) as error:
+        make(tmp_path, tmp_path / "kept")
+    assert str(error.value).startswith(f"report: cannot read {tmp_path / 'kept'}: {message}")
+    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        write_kept(tmp_path / "kept", 2)
+    assert path.read_text() == before
+
+
+def test_nothing_is_imported_that_a_run_folder_names(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "payload.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    write_run(tmp_path / "runs", "avf_qplex", "wtd-s", 1, rising(10))
+    write_run(tmp_path / "runs", "payload", "wtd-s", 2, rising(10))
+    own = write_run(tmp_path / "runs", "avf_qplex", "wtd-s", 3, rising(10), env="payload:wtd-s", gamma=0.5)
+    text = make(tmp_path, tmp_path / "runs")
+    assert not (tmp_path / "ran").exists() and "payload" not in sys.modules
+    assert "'payload' is none of the scripts" in text
+    (row,) = rows(section(text, "Other runs"), "payload:wtd-s")
+    assert row["runs"] == "1" and "gamma=0.5" in row[""] and "floor" not in row, own
+
+
 # Figures
+
+
+def test_a_figure_that_fails_leaves_the_old_one(runs, tmp_path, monkeypatch):
+    make(tmp_path, runs)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(figure, path, **options):
+        Path(path).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", full)
+    with pytest.raises(SystemExit, match=r"^report: cannot write to .*: No space left on device$"):
+        make(tmp_path, runs)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_figures_show_every_curve(runs, tmp_path):

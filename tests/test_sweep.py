@@ -8,6 +8,7 @@ there until the run is finished. Like the scripts it catches no signal, but tell
 import fcntl
 import multiprocessing
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -125,7 +126,7 @@ def place(tmp_path, events, monkeypatch):
 @pytest.fixture(autouse=True)
 def signals():
     """A sweep in this process leaves its handlers behind, and the signals that it got."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in sweep.SIGNALS}
     yield
     sweep.stop.clear()
     for number, handler in handlers.items():
@@ -200,6 +201,11 @@ def test_finished_runs_are_skipped(place, capsys):
         ({"--seeds": "x"}, "sweep: argument --seeds: invalid seeds value: 'x'"),
         ({"--workers": "0"}, "sweep: --workers must be at least 1, got 0"),
         ({"--address": "auto"}, "sweep: --address needs --engine ray"),
+        ({"--seeds": "1-99999999999999999999"}, "sweep: argument --seeds: invalid seeds value: '1-9999"),
+        ({"--seeds": "1000000000000001"}, "sweep: argument --seeds: invalid seeds value: '1000000000000001'"),
+        ({"--runs-dir": ""}, "sweep: argument --runs-dir: invalid folder value: ''"),
+        ({"--record": ""}, "sweep: argument --record: invalid folder value: ''"),
+        ({"--runs-dir": "/proc"}, "sweep: cannot use --record or --runs-dir: "),  # a folder, but nothing can be written
         ({"--runs-dir": __file__}, "sweep: cannot use --record or --runs-dir: "),
         ({"--record": __file__}, "sweep: cannot use --record or --runs-dir: "),
         ({"--": "--seed=1"}, "sweep: --env, --seed and --runs-dir cannot stand behind --"),
@@ -310,6 +316,20 @@ def test_dry_run_writes_nothing(place, capsys):
     ]
 
 
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"total_timesteps": "many"}'])
+def test_a_run_that_was_killed_while_it_began_is_begun_again(place, capsys, text):
+    """It has no checkpoint, and an args.json that is cut short."""
+    sweep.main(command(place))
+    (place / "runs").rename(place / "old")
+    (killed,) = (path for path in (place / "old").glob("*/*") if path.is_dir())
+    begun = place / "runs" / killed.parent.name / killed.name
+    begun.mkdir(parents=True)
+    (begun / "args.json").write_text(text)
+    assert sweep.main(command(place, own=["--dry-run"])) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "counter wtd-s seed 1: run"
+    assert sweep.main(command(place)) == 0 and results(capsys.readouterr().out) == ["finished"]
+
+
 def test_a_crash_is_retried_once_from_the_checkpoint(place, capsys):
     assert sweep.main(command(place, "--crashes=1")) == 0
     printed, told = capsys.readouterr()
@@ -365,7 +385,7 @@ def are_gone(numbers):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_stopped_sweep_ends_its_scripts_and_can_go_on(place, number, capsys):
     """Ctrl-C reaches the whole process group of a sweep. Two runs have a checkpoint then, the third has not begun."""
     arguments = command(place, "--pause=0.1", seeds="1-3")
@@ -383,6 +403,22 @@ def test_a_stopped_sweep_ends_its_scripts_and_can_go_on(place, number, capsys):
     assert sweep.main(arguments) == 0
     assert results(capsys.readouterr().out) == ["finished"] * 3 and logs(place).count("--resume") == 2
     assert len(run_folders(place)) == 3 and not unfinished(place)
+
+
+def test_under_nohup_a_closed_terminal_stops_nothing(place, capsys):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert sweep.main(command(place)) == 0
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN and results(capsys.readouterr().out) == ["finished"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["2>&-", "2>/dev/full"])
+def test_a_closed_or_full_stderr_stops_nothing(place, way):
+    words = shlex.join([sys.executable, str(place / "benchmark" / "sweep.py"), *command(place, "--crashes=1")])
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(f"{words} {way}", shell=True, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 0 and results(done.stdout) == ["finished"]
+    assert len(done.stdout.splitlines()) == 2, "the closing table alone"
 
 
 @pytest.mark.slow
