@@ -5,6 +5,7 @@ checksum: of the code that a run executes, because changed code makes another ru
 own, so the sweep leaves ORIGIN beside its run folders; of a run that was started by hand it is not known, and empty.
 """
 
+import ast
 import contextlib
 import csv
 import fcntl
@@ -62,17 +63,42 @@ def flags_of(usual, arguments):
     return " ".join(f"{name}={value}" for name, value in arguments.items() if usual.get(name, ...) != value)
 
 
-def checksum(algorithm, env):
-    """Of all that a run executes: the script, with the values in force on the task for those it has, and envs/*.py.
+def syntax(path):
+    """The syntax tree of a module, so without comments, and without docstrings."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(getattr(node, "body", None), list):
+            texts = [part for part in node.body if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant)]
+            node.body = [part for part in node.body if part not in texts]
+    return tree
 
-    So a value of Args or DEFAULTS that is changed leaves the recorded runs of tasks that have another what they are.
+
+def checksum(algorithm, env):
+    """Of all that a run executes, whatever its comments and docstrings say: the script, with the values in force on the
+    task, the task's domain and keywords, and the modules that define it.
+
+    These are the domain's, that of "module:id", and what they import from envs/, but for rendering.py, which draws. So
+    a new task, or another value for another task, leaves the recorded runs what they are.
     """
-    values = asdict(load_script(algorithm).parse_args([f"--env={env}"]))
-    field = rf"^(    (?:{'|'.join(values)}): .+?) = (?s:.*?)(?=  # )"  # of Args, no other annotated name
-    script = re.sub(field, r"\1", (ROOT / f"{algorithm}.py").read_text(), flags=re.M)
-    script = re.sub(r"^DEFAULTS = \{.*?^\}", repr(values), script, flags=re.S | re.M)
-    code = [script.encode(), *(path.read_bytes() for path in sorted((ROOT / "envs").glob("*.py")))]
-    return hashlib.sha256(b"".join(code)).hexdigest()[:12]
+    code = [repr(values_of(algorithm, env))]
+    for node in syntax(ROOT / f"{algorithm}.py").body:
+        if isinstance(node, ast.ClassDef) and node.name == "Args":  # its fields are among the values
+            node.body = [part for part in node.body if not isinstance(part, ast.AnnAssign)]
+        if not ast.unparse(node).startswith("DEFAULTS ="):
+            code.append(ast.unparse(node))
+    envs = importlib.import_module("envs")
+    domain, keywords = envs._find(env)[:2]
+    code.append(re.sub(r" at 0x\w+", "", repr((domain, keywords))))  # without the addresses of functions
+    names = {domain.__module__, env.rpartition(":")[0] or domain.__module__}
+    modules, todo = {}, [Path(sys.modules[name].__file__) for name in names]
+    while todo:
+        path = todo.pop()
+        if path not in modules and path.name != "rendering.py":
+            modules[path] = ast.unparse(syntax(path))
+            imports = " ".join(re.findall(r"^ *(?:from|import) envs\b.*", modules[path], re.M))
+            files = [Path(envs.__file__).with_name(f"{word}.py") for word in re.findall(r"\w+", imports)]
+            todo += filter(Path.exists, files)
+    return hashlib.sha256("\n".join([*code, *sorted(modules.values())]).encode()).hexdigest()[:12]
 
 
 def commit():

@@ -196,6 +196,14 @@ def run_jobs(jobs, args):
             record.tell(f"[{done}/{len(jobs)}] {ended}")
 
 
+def task(text):
+    """The id of a task, or "module:id", whose module is imported."""
+    problem = envs.problem(text)
+    if problem:
+        raise argparse.ArgumentTypeError(problem)
+    return text
+
+
 def seeds(text):
     """Those of a word such as 3 or 1-5."""
     first, _, last = text.partition("-")
@@ -225,7 +233,8 @@ def make_jobs(args, options):
     for seed, cell in itertools.product(dict.fromkeys(itertools.chain.from_iterable(args.seeds)), cells):
         algorithm, env, flags, code = cell
         key = algorithm, env, flags, str(seed), code
-        place = args.runs_dir.resolve() / f"{env}__{algorithm}__{seed}__{zlib.crc32(repr(key).encode()):08x}"
+        name = f"{env}__{algorithm}__{seed}__{zlib.crc32(repr(key).encode()):08x}".replace(":", "-")
+        place = args.runs_dir.resolve() / name
         job = dict(zip(record.KEY, key, strict=True)) | dict(key=key, name=f"{algorithm} {env} seed {seed}")
         job |= dict(variant=flags if args.variant is None else args.variant, options=options, place=str(place))
         jobs.append(job | NOT_RUN)
@@ -240,7 +249,7 @@ def main(argv=None):
     parser.error = lambda message: sys.exit(f"sweep: {message}")
     add, names = parser.add_argument, dict(nargs="+", required=True, metavar="NAME")
     add("--algos", choices=record.scripts(), help="names of scripts, without .py", **names)
-    add("--envs", choices=envs.IDS, help="ids of tasks", **names)
+    add("--envs", type=task, help="ids of tasks, or module:id", **names)
     add("--seeds", type=seeds, nargs="+", required=True, help="such as 1-5 or 1 3 7-9")
     add("--workers", type=int, help="runs side by side (default: CPU cores of this machine)")
     add("--runs-dir", type=record.folder, default=Path("runs"), help="folder of the run folders (default: runs)")
