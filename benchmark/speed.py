@@ -81,13 +81,6 @@ def play(script, args, env, agents, steps, buffer=None):
     return seconds
 
 
-def settings(name, env_id, num_envs):
-    """A script's settings on a task, with another number of environments unless that is None."""
-    args = record.load_script(name).parse_args([f"--env={env_id}"])
-    args.num_envs = num_envs or args.num_envs
-    return args
-
-
 def run(checkout, name, flags):
     """CPU seconds of a script of a checkout, in a process of its own."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -216,17 +209,18 @@ def main(argv=None):
         if any(v != parser.get_default(k) for k, v in vars(args).items() if k not in ("scaling", "rounds")):
             sys.exit("speed: --scaling measures sizes of its own: only --rounds goes with it")
         return print_scaling(5 * args.rounds)
-    checkouts = [record.ROOT, args.against] if args.against else [record.ROOT]
-    cells = list(itertools.product(args.scripts, args.envs))
-    for name, env_id in cells:  # what cannot be measured is told before the first measure
-        missing = [f"{place}/{name}.py" for place in checkouts if not (place / f"{name}.py").is_file()]
-        if missing:
-            sys.exit(f"speed: there is no {missing[0]}")
-        plan(name, settings(name, env_id, args.num_envs), args.steps)
+    checkouts, cells = [record.ROOT, *([args.against] if args.against else [])], []
+    for name, env_id in itertools.product(args.scripts, args.envs):
+        if not (checkouts[-1] / f"{name}.py").is_file():
+            sys.exit(f"speed: there is no {checkouts[-1] / name}.py")
+        usual = record.load_script(name).parse_args([f"--env={env_id}"])
+        usual.num_envs = args.num_envs or usual.num_envs
+        plan(name, usual, args.steps)  # what cannot be measured is told before the first measure
+        cells.append((record.load_script(name), usual))
     torch.set_num_threads(1)
     print(f"{'measure':34} {'ms each':>9}", f"{'there':>9}  median ratio (of all rounds)" if args.against else "")
-    for name, env_id in cells:
-        script, usual, measures = record.load_script(name), settings(name, env_id, args.num_envs), {}
+    for script, usual in cells:
+        name, env_id, measures = script.__name__, usual.env, {}
         if not args.against:
             env = envs.make(env_id, usual.num_envs)
             agents = script.make_learner(usual, env)["agents"]
