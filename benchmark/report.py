@@ -227,8 +227,10 @@ def draw_solved(ax, runs, styles):
 
 def table(rows):
     """A Markdown table of rows, {column: cell} each; cells that a row does not have are empty, as are whole columns."""
-    frame = pd.DataFrame(rows, dtype=object).replace("", None).dropna(axis=1, how="all").fillna("")
-    lines = [frame.columns, ["---"] * frame.shape[1], *frame.to_numpy()]
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = [name for name in names if any(row.get(name) not in (None, "") for row in rows)]
+    cells = [["" if row.get(name) is None else row[name] for name in columns] for row in rows]
+    lines = [columns, ["---"] * len(columns), *cells]
     return "".join("| " + " | ".join(map(str, line)) + " |\n" for line in lines) + "\n"
 
 
