@@ -19,8 +19,8 @@ most (an agent with fewer never has the rest available), d numbers of a macro-ob
 Numbered deviations from the paper:
  1. V_i is the best of what is available to agent i, so a busy agent has A_i = 0, as in the authors' later revision of
     the paper. The paper takes the best of all macro-actions (--no-mask-ongoing). A busy agent can have A_i < 0 then,
-    weighted by lambda_i(s, m), which depends on the others' choices. Greedy agents may miss the team's best choice,
-    which breaks Mac-IGM (theory/README.md).
+    weighted by lambda_i(s, m), which depends on the others' choices. Greedy agents may miss the team's best choice:
+    this breaks Mac-IGM, that is, IGM for macro-actions (theory/README.md).
  2. A_i is Q_i - max Q_i <= 0 (Eq. 4). With a dueling head (Def. 3.3 allows A_i > 0) this mixer would break Mac-IGM.
  3. The mixer is two networks with 128 hidden units, of s and of (s, m), not a small one for each head and purpose.
  4. An episode that is cut by the horizon bootstraps from its final observation, where every agent counts as free.
@@ -82,7 +82,7 @@ class Args:
     obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
-    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps as that
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps
     hidden_size: int = 64  # width of the networks' layers
     ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities learn, are constants, or are 0
     mixer_state: Literal["joint", "single", "real", "real-both", "decision"] = "joint"  # see mixer_states
@@ -218,7 +218,7 @@ class QPLEXMixer(nn.Module):
         self.action_net = nn.Sequential(nn.Linear(joint_size, hidden), nn.ReLU(), nn.Linear(hidden, heads * n_agents))
 
     def forward(self, utilities, actions, available, state):
-        """Joint values float32 [B, T] of actions, int64 [B, T, n], in states, float32 [B, T, S].
+        """Joint values float32 [B, T] of actions, int64 [B, T, n], in states, float32 [B, T, state_size].
 
         utilities: float32 [B, T, n, A]. available: bool [B, T, n, A].
         """
@@ -288,7 +288,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to `ended`, after a final row, at which macro_done holds for all."""
+        """Ends episodes that are over, bool [N], with a row whose actions are not used, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -345,9 +345,9 @@ def mixer_states(batch, kind):
     single = batch["macro_state"].take_along_dim(agent[..., None, None], 2)[:, :, 0]
     return {
         "joint": (joint, joint),  # the macro-states of all agents, the paper's method
-        "single": (single, state),  # the macro-state of an agent free at the next row; there, `state`
+        "single": (single, state),  # that of an agent free at the next row, where it is `state`
         "real": (last_state, state),  # the state a step before the next row; for Q' the row's state
-        "real-both": (last_state, last_state),  # the state a step before the next row for both
+        "real-both": (last_state, last_state),  # for Q', too, a step before the row after its own
         "decision": (state, state),  # the row's state for both
     }[kind]
 
@@ -526,7 +526,7 @@ def train(args):
             optimizer.step()
             for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
                 slow.lerp_(fast.detach(), 1 - args.polyak)
-            if step % 1000 < args.num_envs:
+            if not step // args.train_frequency % 100:  # one in a hundred
                 writer.add_scalar("losses/td_loss", loss, step)
                 writer.add_scalar("losses/q_values", q.mean(), step)
 
@@ -602,7 +602,7 @@ def parse_args(argv=None):
             saved["resume"] = known.resume
             return Args(**saved)
     env = known.env or Args.env
-    defaults = envs.defaults(env, Args)
+    defaults = envs.defaults(env, Args)  # of a task of your own, if it brings some
     for beginning, values in DEFAULTS.items():
         if env.startswith(beginning):
             defaults = values

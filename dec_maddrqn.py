@@ -82,7 +82,7 @@ class Args:
     obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
-    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps as that
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps
     hidden_size: int = 64  # width of the networks' layers
 
     def __post_init__(self):
@@ -241,7 +241,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to `ended`, after a final row, at which macro_done holds for all."""
+        """Ends episodes that are over, bool [N], with a row whose actions are not used, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -462,7 +462,7 @@ def train(args):
             optimizer.step()
             for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
                 slow.lerp_(fast.detach(), 1 - args.polyak)
-            if step % 1000 < args.num_envs:
+            if not step // args.train_frequency % 100:  # one in a hundred
                 writer.add_scalar("losses/td_loss", loss, step)
                 writer.add_scalar("losses/q_values", q.mean(), step)
 
@@ -538,7 +538,7 @@ def parse_args(argv=None):
             saved["resume"] = known.resume
             return Args(**saved)
     env = known.env or Args.env
-    defaults = envs.defaults(env, Args)
+    defaults = envs.defaults(env, Args)  # of a task of your own, if it brings some
     for beginning, values in DEFAULTS.items():
         if env.startswith(beginning):
             defaults = values

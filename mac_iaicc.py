@@ -266,7 +266,7 @@ class EpisodeBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to `ended`, after a final row, at which macro_done holds for all."""
+        """Ends episodes that are over, bool [N], with a row whose actions are not used, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -575,7 +575,7 @@ def parse_args(argv=None):
             saved["resume"] = known.resume
             return Args(**saved)
     env = known.env or Args.env
-    defaults = envs.defaults(env, Args)
+    defaults = envs.defaults(env, Args)  # of a task of your own, if it brings some
     for beginning, values in DEFAULTS.items():
         if env.startswith(beginning):
             defaults = values

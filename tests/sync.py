@@ -108,7 +108,7 @@ OWN_LINES = {
 
             for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
 
-            if step % 1000 < args.num_envs:
+            if not step // args.train_frequency % 100:  # one in a hundred
                 writer.add_scalar("losses/td_loss", loss, step)
                 writer.add_scalar("losses/q_values", q.mean(), step)
 
