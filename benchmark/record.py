@@ -19,6 +19,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import threading
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -35,6 +36,7 @@ ORIGIN = "origin.json"
 KEY = ["algorithm", "env", "flags", "seed", "checksum"]
 VALUES = ["return", "discounted_return", "length", "success"]
 RUNS = "algorithm env variant seed flags commit checksum steps seconds processor date".split()
+ONE_AT_A_TIME = threading.Lock()  # Python 3.11 cannot make two syntax trees in two threads at once
 TABLES = {"runs.csv": RUNS, "evaluations.csv": [*KEY, "step", *VALUES]}
 
 
@@ -65,7 +67,8 @@ def flags_of(usual, arguments):
 
 def syntax(path):
     """The syntax tree of a module, so without comments, and without docstrings."""
-    tree = ast.parse(path.read_text())
+    with ONE_AT_A_TIME:
+        tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(getattr(node, "body", None), list):
             texts = [part for part in node.body if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant)]

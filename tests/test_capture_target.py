@@ -363,7 +363,7 @@ def test_the_seed_decides_the_trajectory(env_id):
 
 
 def test_the_single_view_is_the_batch_of_one():
-    batch, single = envs.make("ct-10"), envs.make_single("ct-10")
+    batch, single = envs.make("ct-10"), envs.SingleMacroEnv(envs.make("ct-10"))
     obs, _ = batch.reset(seed=5)
     single_obs, _ = single.reset(seed=5)
     np.testing.assert_array_equal(single_obs, obs[0])

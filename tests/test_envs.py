@@ -197,15 +197,6 @@ def test_infos_of_one_environment_can_be_written_down(env_id):
     assert infos["success"].dtype == bool and not infos["success"].any()
 
 
-def test_a_saved_state_without_the_generator_is_refused():
-    env = envs.make("ct-10", 2)
-    env.reset(seed=0)
-    saved = env.save_state()
-    saved.pop("np_random")
-    with pytest.raises(ValueError, match="the saved state has no 'np_random'"):
-        env.load_state(saved)
-
-
 def test_a_reset_takes_its_option_and_no_other():
     batch = envs.make("bp-10", 2)
     for env in (batch, gym.make("bp-10-v0").unwrapped):

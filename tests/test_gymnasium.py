@@ -225,7 +225,7 @@ def test_a_task_with_a_mistake_gets_one_line():
     assert envs.problem("unknown-keyword") == f"unknown-keyword: TypeError: WaitingGame.__init__() got an {message}"
     assert envs.problem("bad-value") == "bad-value: ValueError: grid must be even, got 7"
     line = "Broken._advance: rewards must be float64 (1,), got float32 (1,)"
-    assert envs.problem("bad-step") == f"bad-step: ValueError: {line}"
+    assert envs.problem("bad-step") == f"bad-step: TaskError: {line}"
 
 
 # ---- what gymnasium.make takes --------------------------------------------------------------------------------------

@@ -440,23 +440,25 @@ def test_a_module_that_a_model_names_is_imported_only_if_it_is_given(edit, tmp_p
     package.mkdir(parents=True)
     for name in ("__init__", "payload"):
         (package / f"{name}.py").write_text(f"from pathlib import Path\nPath({str(package / 'ran')!r}).touch()\n")
+    with (package / "payload.py").open("a") as file:
+        file.write("import envs\nenvs.register('mine', envs.Warehouse, layout='s')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    edit({"env": "runs.evil.payload:wtd-s"})
-    message = r"names a module, which is imported only if you add --env 'runs\.evil\.payload:wtd-s'"
+    edit({"env": "runs.evil.payload:mine"})
+    message = r"names a module, which is imported only if you add --env 'runs\.evil\.payload:mine'"
     refused(message)
     with pytest.raises(SystemExit, match=message):
         play.main([str(tmp_path)])
-    refused("is of the task 'runs.evil.payload:wtd-s', not of 'wtd-s'", env="wtd-s")
-    refused("is of the task 'runs.evil.payload:wtd-s', not of 'runs.evil:wtd-s'", env="runs.evil:wtd-s")
-    refused("is of the task 'runs.evil.payload:wtd-s', not of ''", env="")
+    refused("is of the task 'runs.evil.payload:mine', not of 'wtd-s'", env="wtd-s")
+    refused("is of the task 'runs.evil.payload:mine', not of 'runs.evil:mine'", env="runs.evil:mine")
+    refused("is of the task 'runs.evil.payload:mine', not of ''", env="")
     assert not (package / "ran").exists()
-    edit({"env": ["runs.evil.payload:wtd-s"]})
+    edit({"env": ["runs.evil.payload:mine"]})
     refused("names a module")
-    edit({"env": "runs.evil.payload:wtd-s"}, algorithm="runs.evil.payload")
+    edit({"env": "runs.evil.payload:mine"}, algorithm="runs.evil.payload")
     refused("is of 'runs.evil.payload', which is none of avf_vdn avf_qmix")
     assert not (package / "ran").exists()
-    edit({"env": "runs.evil.payload:wtd-s"})
-    assert play.load_run(tmp_path, "best", env="runs.evil.payload:wtd-s")[1].env == "runs.evil.payload:wtd-s"
+    edit({"env": "runs.evil.payload:mine"})
+    assert play.load_run(tmp_path, "best", env="runs.evil.payload:mine")[1].env == "runs.evil.payload:mine"
     assert (package / "ran").exists()
 
 

@@ -197,7 +197,7 @@ def test_finished_runs_are_skipped(place, capsys):
     [
         ({"--algos": "dqn"}, "sweep: argument --algos: invalid choice: 'dqn' (choose from "),
         ({"--envs": "wtd-x"}, "sweep: argument --envs: unknown environment 'wtd-x' (did you mean "),
-        ({"--envs": "no_module:wtd-s"}, "sweep: argument --envs: No module named 'no_module'"),
+        ({"--envs": "no_module:my-task"}, "sweep: argument --envs: No module named 'no_module'"),
         ({"--seeds": "5-1"}, "sweep: argument --seeds: invalid seeds value: '5-1'"),
         ({"--seeds": "1-2-3"}, "sweep: argument --seeds: invalid seeds value: '1-2-3'"),
         ({"--seeds": "x"}, "sweep: argument --seeds: invalid seeds value: 'x'"),

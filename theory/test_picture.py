@@ -58,7 +58,7 @@ def test_picture_is_drawn(tmp_path, capsys):
         (optimism, ["--seed", "-1"], "--seed must be from 0"),
         (expressiveness, ["--fast"], "expressiveness: unrecognized arguments"),
         (deviations, [], "deviations: .*required: run"),
-        (deviations, ["nowhere"], "there is no folder nowhere"),
+        (deviations, ["nowhere"], "there is no model nowhere/last.pt"),
         (deviations, ["nowhere", "--pairs", "-1"], "deviations: --show and --pairs must not be negative"),
     ],
 )

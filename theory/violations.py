@@ -134,6 +134,9 @@ def parse_args(argv=None):
     if min(options.every, options.parts) < 1:
         parser.error("--every and --parts must be at least 1")
     args = avf_qplex.parse_args([*flags, f"--seed={options.seeds[-1]}"])
+    problem = envs.problem(args.env)
+    if problem:
+        parser.error(problem)
     n_actions = envs.make(args.env).n_actions
     joint = max(n_actions) ** len(n_actions)
     if joint > MOST_JOINT:
