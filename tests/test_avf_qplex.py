@@ -597,6 +597,7 @@ def test_smoke_run_takes_gradient_steps(tmp_path, monkeypatch, env_id):
     smoke(tmp_path, monkeypatch, avf_qplex, env_id)
 
 
+@pytest.mark.slow
 def test_same_seed_same_curve_and_seed_zero_counts(tmp_path, matrix_game):
     """A seed changes what is played and what is learned."""
     curves = []

@@ -50,6 +50,7 @@ def first_episodes(env, choose):
 
 
 # ---- statistics -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "n_agents, slip, capture_rate, rate_error, mean_length, length_error",
     [(10, 0.1, 0.525, 0.009, 46.0, 0.3), (10, 0.0, 0.891, 0.006, 30.3, 0.3), (5, 0.1, 0.902, 0.005, 29.5, 0.3)],

@@ -135,6 +135,7 @@ def test_a_run_takes_gradient_steps(tmp_path, monkeypatch, env_id):
     assert check_gradient_steps(dec_maddrqn, env_id, tmp_path, monkeypatch) == (1_200 - 200) // 40
 
 
+@pytest.mark.slow
 def test_same_seed_same_curve(tmp_path, monkeypatch):
     check_seeds(dec_maddrqn, "bp-10", tmp_path, monkeypatch, train_frequency=16)
 

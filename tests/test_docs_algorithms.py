@@ -47,6 +47,7 @@ def test_names_of_the_tables_are_in_the_script(name):
 LOGGED = {}  # script: keys of a short run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_every_logged_key_is_explained(name, tmp_path, monkeypatch):
     script, keys = import_module(name), set()

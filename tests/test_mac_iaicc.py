@@ -315,6 +315,7 @@ def test_a_run_takes_gradient_steps_and_target_critics_follow(tmp_path, monkeypa
     assert check_gradient_steps(mac_iaicc, env_id, tmp_path, monkeypatch, learning_rate=0.01) == 12
 
 
+@pytest.mark.slow
 def test_same_seed_same_curve(tmp_path, monkeypatch):
     names = ("actor_loss", "critic_loss", "entropy", "values")
     check_seeds(mac_iaicc, "bp-10", tmp_path, monkeypatch, {f"losses/{name}" for name in names})

@@ -136,12 +136,14 @@ def test_bounds_by_hand():
 # ---- what they learn ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", VALUES, ids=lambda s: s.__name__)
 def test_additive_game_is_fitted_by_all(play, script):
     greedy, values = play(script, "additive")
     assert greedy == 8 and worst(values, ADDITIVE) < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", VALUES[1:], ids=lambda s: s.__name__)
 def test_monotonic_game_is_fitted_by_a_monotone_mixer(play, script):
     greedy, values = play(script, "monotonic")

@@ -102,6 +102,7 @@ def test_the_recorder_changes_nothing_and_agrees_with_the_masks_of_the_environme
             assert (np.array(running)[start:end, agent] == action).all()
 
 
+@pytest.mark.slow
 def test_watching_gives_the_results_of_the_script_and_its_first_episode(run, brief):
     script, args, learner, _ = play.load_run(run, "best")
     expected = script.evaluate(learner["agents"], envs.make(args.env, 4), args.gamma, 5)
@@ -259,6 +260,7 @@ def test_what_is_printed(run, brief, capsys, monkeypatch):
     assert lines[3] == "length               12.000 +- 0.000 (standard error)"
 
 
+@pytest.mark.slow
 def test_the_files_that_are_written(run, tmp_path, brief, capsys):
     gif, whole_png, part = tmp_path / "team.GIF", tmp_path / "team.png", tmp_path / "part.png"
     play.main([str(run), "--episodes=2", f"--gif={gif}", f"--timeline={whole_png}"])
@@ -271,6 +273,7 @@ def test_the_files_that_are_written(run, tmp_path, brief, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["part.png", "team.GIF", "team.png"]
 
 
+@pytest.mark.slow
 def test_the_timeline_is_written_as_its_suffix_says(run, tmp_path, brief):
     svg, pdf = tmp_path / "team.SVG", tmp_path / "team.pdf"
     play.main([str(run), "--episodes=1", f"--timeline={svg}"])
@@ -282,6 +285,7 @@ def test_the_timeline_is_written_as_its_suffix_says(run, tmp_path, brief):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["team.SVG", "team.pdf"]
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_only_for_a_timeline_and_without_a_window_system():
     seen = "print([name in sys.modules for name in ('matplotlib', 'matplotlib.pyplot')])"
     command = [sys.executable, "-c", f"import sys; import play; {seen}; import timeline; {seen}"]
@@ -289,6 +293,7 @@ def test_matplotlib_is_imported_only_for_a_timeline_and_without_a_window_system(
     assert program.stdout.splitlines() == ["[False, False]", "[True, False]"], program.stderr
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_seen_enough_is_no_error(run):
     command = [sys.executable, play.__file__, str(run), "--episodes=1"]
     program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -604,6 +609,7 @@ def test_a_task_that_raises_ends_with_its_name(run, brief, monkeypatch):
         play.main([str(run), "--episodes=1"])
 
 
+@pytest.mark.slow
 def test_a_long_animation_is_cut_and_play_says_so(run, tmp_path, brief, capsys, monkeypatch):
     gif = tmp_path / "team.gif"
     monkeypatch.setattr(play, "MOST_FRAMES", 13)

@@ -70,6 +70,7 @@ def test_the_frames_of_an_episode_have_one_size_and_show_something_new(env_id):
     assert env.elapsed[0] > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "changes"), CUSTOM)
 def test_custom_layouts_are_drawn_from_reset_to_end_at_one_size(env_id, changes):
     sizes = {frame.shape for frame in episode(started(env_id, **changes), np.random.default_rng(1))}
@@ -181,6 +182,7 @@ def test_every_array_of_the_simulator_is_among_those_tested():
         assert set(envs.make(env_id).sim_arrays) <= {name for name, *_ in changes}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", envs.IDS)
 def test_agents_on_one_spot_are_all_visible(env_id):
     env = started(env_id)
@@ -211,6 +213,7 @@ def test_a_late_human_is_red_until_it_gets_its_tool():
     assert pixels_of(picture(env), rendering.ALARM) == 0
 
 
+@pytest.mark.slow
 def test_the_big_box_lights_up_while_both_push_it():
     env = started("bp-30")
     while not (env.last_waypoint[0] >= 2).all():

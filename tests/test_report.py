@@ -262,6 +262,7 @@ def test_the_papers_numbers_are_the_papers():
     }
 
 
+@pytest.mark.slow
 def test_the_grid_has_the_runs_of_every_panel():
     """grid.sh records what paper.json compares, under the names of its variants, and nothing else."""
     grid = set()
@@ -290,6 +291,7 @@ def kept(runs, tmp_path):
     return tmp_path / "kept"
 
 
+@pytest.mark.slow
 def test_recorded_runs_give_the_report_of_their_folders(runs, kept, tmp_path):
     text, again = make(tmp_path / "a", runs), make(tmp_path / "b", kept)
     assert section(again, "Figure 4") == section(text, "Figure 4")
@@ -450,6 +452,7 @@ def test_nothing_is_imported_that_a_run_folder_names(tmp_path, monkeypatch):
 # Figures
 
 
+@pytest.mark.slow
 def test_a_figure_that_fails_leaves_the_old_one(runs, tmp_path, monkeypatch):
     make(tmp_path, runs)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -464,6 +467,7 @@ def test_a_figure_that_fails_leaves_the_old_one(runs, tmp_path, monkeypatch):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_figures_show_every_curve(runs, tmp_path):
     text = make(tmp_path, runs)
     others = [colour for colour, _ in report.PAPER["other styles"]]
@@ -478,6 +482,7 @@ def test_figures_show_every_curve(runs, tmp_path):
             assert (np.abs(pixels - rgb).max(2) < 8).sum() > 200, (name, colour)
 
 
+@pytest.mark.slow
 def test_figure_4_has_the_papers_layout(tmp_path, monkeypatch):
     """3 + 4 panels, those without runs empty, and rows without runs not there."""
     made = []

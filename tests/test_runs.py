@@ -159,6 +159,7 @@ def test_killed_and_resumed_equals_undisturbed(tmp_path, processes, script):
     assert_same_run(undisturbed, folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_interrupted_and_resumed_equals_undisturbed(tmp_path, monkeypatch, script):
     """Ctrl-C comes at step 520 of 700, the last checkpoint is of step 412, and episodes have ended in between.
@@ -285,6 +286,7 @@ def test_a_kill_costs_at_most_a_minute(tmp_path, monkeypatch):
 
 
 # ---- what a run leaves ----------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_finished_run(tmp_path, monkeypatch, capsys):
     """What it printed, what is in its folder, and that it cannot be resumed."""
     options = {**TINY, "seed": 3, "runs_dir": tmp_path, "checkpoint_frequency": 0.05}
@@ -660,6 +662,7 @@ def test_no_file_decides_which_module_is_imported(tmp_path, monkeypatch):
     assert said == "--env: SystemExit: it was imported (in the import of 'my_task')"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_gradient_that_is_not_finite_ends_the_run(tmp_path, monkeypatch, script):
     """It names the step. The models of the evaluation before are kept, and their weights are finite."""

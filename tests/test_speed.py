@@ -53,6 +53,7 @@ def table(capsys):
     return {line[:34].strip(): line[34:].split() for line in lines[1:]}
 
 
+@pytest.mark.slow
 def test_every_measure_is_taken(tmp_path, capsys, monkeypatch):
     """Acting is the script's, training a stand-in's: the tests below have the real script's word on its flags."""
     monkeypatch.setattr(speed.record, "ROOT", stand_in(tmp_path, 0.0, 0.00001, 0.001))
@@ -135,6 +136,7 @@ def test_an_actor_critic_is_idle_where_its_batch_is_never_full(tmp_path):
     assert "batch-size" not in learning and "train-frequency" not in learning
 
 
+@pytest.mark.slow
 def test_two_checkouts_take_turns(tmp_path, monkeypatch, capsys):
     """Here an update takes 10 ms, there 5 ms."""
     here, there = stand_in(tmp_path / "here", 0.0, 0.0, 0.01), stand_in(tmp_path / "there", 0.0, 0.0, 0.005)

@@ -243,6 +243,7 @@ def test_progress_bar_on_a_terminal(place, capsys, monkeypatch):
     assert "2/2" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_is_known_by_its_flags_and_code(place, capsys):
     """Another value of a flag is another run, a default in words is not; nor are runs started by hand the sweep's."""
     for extra, runs in (((), 1), (("--note=a",), 2), (("--note=b",), 3), (("--note", "a"), 3), (("--crashes=0",), 3)):
@@ -262,6 +263,7 @@ def test_a_run_is_known_by_its_flags_and_code(place, capsys):
     assert record.describe(own.parent)["checksum"] == "" != record.describe(run_folders(place)[-1])["checksum"]
 
 
+@pytest.mark.slow
 def test_a_value_of_another_family_leaves_the_checksum(tmp_path, monkeypatch):
     """A value of Args or DEFAULTS counts on the tasks on which it is in force, anything else on all."""
     monkeypatch.setattr(record, "ROOT", tmp_path)
@@ -410,6 +412,7 @@ def test_a_script_that_somebody_else_stops_is_not_tried_again(place, capsys, how
     assert len(run_folders(place)) == 1
 
 
+@pytest.mark.slow
 def test_a_run_that_crashes_again_is_reported_and_the_others_go_on(place, capsys):
     sweep.main(command(place, "--crashes=9", "--total-timesteps=2"))  # ends before the crash
     assert sweep.main(command(place, "--crashes=3", seeds="1-2")) == 1
@@ -421,6 +424,7 @@ def test_a_run_that_crashes_again_is_reported_and_the_others_go_on(place, capsys
     assert results(capsys.readouterr().out) == ["finished"] * 2
 
 
+@pytest.mark.slow
 def test_a_run_that_another_process_works_on_is_left_to_it(place, capsys, monkeypatch):
     sweep.main(command(place))
     shutil.rmtree(run_folders(place)[0])
@@ -504,6 +508,7 @@ def recorded(place):
     return [pd.read_csv(place / "kept" / name, keep_default_na=False) for name in ("runs.csv", "evaluations.csv")]
 
 
+@pytest.mark.slow
 def test_recorded_runs_are_kept_and_skipped_without_their_folders(place, capsys):
     keep = ["--record", str(place / "kept"), "--workers", "2"]
     assert sweep.main(command(place, seeds="1-2")) == 0

@@ -207,6 +207,7 @@ def covered(figure):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["bp-10", "wtd-s", "wtd-t1", "ct-10", "wtd-s-primitive"])
 @pytest.mark.parametrize("steps", [None, (0, 40), (3, 8)])
 def test_no_text_covers_another_or_leaves_the_picture(env_id, steps):
@@ -286,6 +287,7 @@ def test_names_without_room_are_shortened_or_written_once_and_explained(episode)
     assert said(figure.axes[0])[-1] == "GtSB: Go-to-Small-Box · Tr: Turn-right"
 
 
+@pytest.mark.slow
 def test_files_are_vectors_with_text_and_the_same_each_time(episode, tmp_path):
     def written(name):
         path = tmp_path / name

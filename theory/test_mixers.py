@@ -153,6 +153,7 @@ def random_free_or_busy(sizes, count, rng):
 
 
 # ---- what holds at any weights --------------------------------------------------------------------------------------
+@pytest.mark.slow
 @every_consistent_mixer
 @settings(deadline=None, max_examples=100)
 @given(data=st.data())

@@ -50,6 +50,7 @@ def test_the_best_other_macro_action_is_no_push():
     assert optimism.best_other(utilities).tolist() == [7, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", optimism.SCRIPTS, ids=lambda script: script.__name__)
 def test_what_a_team_has_learned_is_read(tmp_path, script):
     """Values of two choices that are not the same, in units of rewards, not of scaled ones."""

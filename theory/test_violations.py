@@ -76,6 +76,7 @@ def test_what_a_run_loses_is_in_units_of_unscaled_rewards(monkeypatch):
     assert found["lost"].tolist() == pytest.approx([60.0] * len(found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mask_ongoing", [False, True])
 def test_a_run_is_counted(mask_ongoing, monkeypatch):
     """New networks hardly differ: what they lose is little, but more than rounding."""
@@ -94,6 +95,7 @@ def test_a_run_is_counted(mask_ongoing, monkeypatch):
         assert found["lost"].sum() > 0
 
 
+@pytest.mark.slow
 def test_the_program(capsys):
     flags = [f"--{key.replace('_', '-')}={value}" for key, value in TINY.items()]
     command = ["--seeds", "3-4", "--every", "5", "--parts", "2", "--env=bp-10", "--no-mask-ongoing"]
