@@ -39,6 +39,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         episode_return: float64 [N], the undiscounted return of the episode so far.
         over: bool [N], whether the episode has ended. It is True before the first reset, too.
         success: bool [N], whether the task's goal was reached in the last step.
+        cut: bool [N], whether something else than the horizon cut the episode in the last step. `_advance` may set it.
 
     A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`. If its
     macro-actions have initiation sets, it overrides `_can_start`. It names the arrays that hold its simulator state in
@@ -88,6 +89,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.episode_return = np.zeros(num_envs)
         self.over = np.ones(num_envs, bool)
         self.success = np.zeros(num_envs, bool)
+        self.cut = np.zeros(num_envs, bool)
         self.available = np.tile(self.own_actions, (num_envs, 1, 1))
         self._obs = np.zeros((num_envs, *self.single_observation_space.shape), np.float32)
 
@@ -101,7 +103,8 @@ class MacroVectorEnv(VectorEnv, ABC):
         """Takes one step of the macro-action that each agent runs.
 
         `macro_done` is still that of the step before: where it is True, the agent starts its `macro_action` in this
-        step. `elapsed` already counts this step.
+        step. `elapsed` already counts this step. `cut` is False everywhere: set it where the episode is cut (truncated)
+        in this step by something else than the horizon.
 
         Returns:
             rewards float64 [N]
@@ -125,6 +128,9 @@ class MacroVectorEnv(VectorEnv, ABC):
         By default these are all that it has. A free agent must have at least one that it can start.
         """
         return np.broadcast_to(self.own_actions, self.available.shape)
+
+    def _restore(self):
+        """Called by `load_state` after the arrays are set. A domain that holds more than arrays makes it from them."""
 
     @abstractmethod
     def _draw(self, index):
@@ -195,9 +201,10 @@ class MacroVectorEnv(VectorEnv, ABC):
         # "unsafe" lets actions be of any integer dtype. They are in range where they are copied.
         np.copyto(self.macro_action, actions, where=self.macro_done, casting="unsafe")
         self.elapsed += 1
+        self.cut[:] = False
         rewards, terminations, ended, success = self._advance()
         self.success = success.copy()  # a later reset writes into it, and a domain may return one array for both
-        truncations = (self.elapsed >= self.horizon) & ~terminations
+        truncations = ((self.elapsed >= self.horizon) | self.cut) & ~terminations
         self.over = terminations | truncations
         self.macro_done = ended | self.over[:, None]
         self.episode_return += rewards
@@ -284,6 +291,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         for name in self._checkpointed():
             setattr(self, name, np.asarray(saved[name]).copy())
         self.np_random.bit_generator.state = json.loads(bytes(np.asarray(saved["np_random"])))
+        self._restore()
         self._update_available()
         return self._obs.copy(), self._infos()
 
