@@ -5,12 +5,8 @@ import pytest
 from gymnasium import Env
 from gymnasium.spaces import Box, Discrete, MultiDiscrete, Tuple
 
-import avf_vdn
-import envs
 from envs.options import Option, OptionError, OptionsEnv
-from tests.short_runs import short
 from tests.test_envs import assert_same
-from tests.test_runs import assert_same_run, interrupted, resume
 
 
 class Corridor:
@@ -136,7 +132,7 @@ def test_sizes_and_what_is_seen():
         assert obs[e, 1].tolist() == [0, 0, 0.5, 0, 0, 0, 0, 0]
         assert infos["state"][e].tolist() == [*(0.5 * np.eye(6)[start[e]]), *[0] * 10]
     obs, _, _, _, infos = env.step(np.array([[1, 0], [2, 0]]))
-    at = [start[0], start[1]]  # the first Ann is busy, so she has seen nothing new; the second rested, and is free
+    at = start  # the first Ann is busy, so she has seen nothing new; the second rested, and is free
     for e in range(2):
         assert obs[e, 0].tolist() == [*(0.5 * np.eye(6)[at[e]]), 0, 0.5 * e]
     bob = [0.5, 0.05]
@@ -144,6 +140,9 @@ def test_sizes_and_what_is_seen():
     first = [*(0.5 * np.eye(6)[start[0] + 1]), *bob, *[0, 1, 0, 0.1], *busy]
     second = [*(0.5 * np.eye(6)[start[1]]), *bob, *[0, 0, 0, 0], *busy]
     np.testing.assert_allclose(infos["state"], [first, second], rtol=1e-6)
+    env.step(np.array([[1, 0], [2, 0]]))
+    _, _, _, _, infos = env.step(np.array([[1, 0], [2, 0]]))
+    np.testing.assert_allclose(infos["state"][:, -4:], [busy, busy], err_msg="Bob has begun his second walk", rtol=1e-6)
 
 
 def test_a_state_of_ones_own():
@@ -174,31 +173,64 @@ def test_initiation_sets_are_available():
 
 
 def test_an_agent_that_leaves_early_is_busy_until_the_end():
-    """Bob leaves after five steps, in the middle of his macro-action; Ann rests on, and step 12 truncates."""
-    env = corridor(options=[[REST], [Option("End", to_the_end)]])
+    """Bob leaves at step 5, in the middle of his second walk; Ann rests on, and step 12 truncates."""
+    env = corridor(options=[[REST], [walk(3)]])
     env.reset(seed=0)
     rewards = []
     for step in range(1, 13):
         obs, reward, terminations, truncations, infos = env.step(np.zeros((1, 2), int))
         rewards.append(reward[0])
         is_last = step == 12
-        assert infos["macro_done"][0].tolist() == [True, is_last]
+        assert infos["macro_done"][0].tolist() == [True, is_last or step == 3]
         assert not terminations[0] and truncations[0] == is_last
     assert rewards == [-0.5] * 4 + [9.5] + [0.0] * 7
     assert obs[0, 1].tolist() == [0.0] * 6, "who has left observes zeros"
 
 
+class Late(Corridor):
+    """Bob comes after the first step."""
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed)
+        self.agents = ["ann"]
+        return self._observe(self.agents), {"ann": {}}
+
+    def step(self, actions):
+        result = super().step(actions)
+        if self.time == 1:
+            self.agents.append("bob")
+        return result
+
+
+def test_an_agent_that_comes_late_chooses_when_it_is_there():
+    """Nobody asks for its initiation set before, and in the second episode nothing of the first goes on."""
+    walks = Option("Walk", walk(4, speed=0).run, lambda sim, agent: sim.agents.index("bob") == 1)
+    env = OptionsEnv(make=Late, options=[[REST], [walks]], horizon=20)
+    env.reset(seed=0)
+    for _ in range(2):
+        free = [env.step(np.zeros((1, 2), int))[4]["macro_done"][0, 1] for _ in range(12)]
+        assert np.flatnonzero(free).tolist() == [0, 4, 8, 11]
+        env.reset()
+
+
+def at_the_last_moment(sim, agent):
+    while True:
+        yield 1 if 12 - sim.time <= 5 - sim.at["ann"] else 0
+
+
 def test_terminated_and_truncated_are_kept_apart():
-    """All reach the end: terminated. The simulator's own limit, of 12 steps, and the horizon: truncated."""
+    """If all reach the end, it is terminated. The simulator's limit of 12 steps and the horizon truncate."""
     hurry = [Option("End", to_the_end)]
+    linger = [Option("Linger", at_the_last_moment)]
     ends = []
-    for options, horizon in ((hurry, 20), ([REST], 20), ([REST], 7)):
+    for options, horizon in ((hurry, 20), ([REST], 20), ([linger, [REST]], 20), ([linger, hurry], 20), ([REST], 7)):
         env = corridor(options=options, horizon=horizon)
         env.reset(seed=0)
         while not env.over[0]:
             _, _, terminations, truncations, _ = env.step(np.zeros((1, 2), int))
-        ends.append((env.elapsed[0], terminations[0], truncations[0]))
-    assert ends == [(5, True, False), (12, False, True), (7, False, True)]
+        ends.append((int(env.elapsed[0]), bool(terminations[0]), bool(truncations[0])))
+    cut = (12, False, True)
+    assert ends == [(5, True, False), cut, cut, (12, True, False), (7, False, True)]
 
 
 def test_success_is_asked_for_at_the_end_of_an_episode():
@@ -305,12 +337,18 @@ def test_a_simulator_that_does_not_repeat_itself_is_noticed(capsys, monkeypatch)
     assert not other.step(actions)[3].any()
 
 
-@pytest.mark.parametrize("harm", ["raises", "ends", "pays"])
+@pytest.mark.parametrize("harm", ["raises", "ends", "pays", "shows", "hides"])
 def test_whatever_comes_out_otherwise_is_noticed(capsys, monkeypatch, harm):
-    """An option that fails, an episode that is over before, another return."""
-    env = corridor(2)
+    """An option that fails, an episode that is over before, another return, observation or state."""
+    monkeypatch.setattr(Corridor, "light", 0.0, raising=False)
+    sees = dict(
+        observe=lambda sim, agent: [sim.light if harm == "shows" else 0.0],
+        state=lambda sim: [sim.light if harm == "hides" else 0.0],
+    )
+    env = corridor(2, **sees)
     env.reset(seed=1)
-    random_play(env, 3)
+    env.step(np.array([[2, 0], [1, 0]]))
+    env.step(np.array([[1, 0], [1, 0]]))
     saved = env.save_state()
     step = Corridor.step
 
@@ -323,25 +361,12 @@ def test_whatever_comes_out_otherwise_is_noticed(capsys, monkeypatch, harm):
         return obs, rewards, terminations, truncations, infos
 
     monkeypatch.setattr(Corridor, "step", other_step)
-    other = corridor(2, options=[[Option("Silent", silent)] * 3, OPTIONS[1]] if harm == "raises" else OPTIONS)
-    other.load_state(saved)
+    other = corridor(2, options=[[Option("Silent", silent)] * 3, OPTIONS[1]] if harm == "raises" else OPTIONS, **sees)
+    monkeypatch.setattr(Corridor, "light", 1.0)
+    _, infos = other.load_state(saved)
+    np.testing.assert_array_equal(other.views, saved["views"])
+    assert infos["available"].tolist() == [[[False, True, False], [True, True, False]]] * 2
     assert capsys.readouterr().err.startswith("2 of 2 episodes did not repeat themselves")
-
-
-@pytest.fixture
-def task(monkeypatch):
-    """A task of the corridor."""
-    monkeypatch.setitem(envs._TASKS, "corridor", (OptionsEnv, dict(make=Corridor, options=OPTIONS, horizon=20)))
-
-
-@pytest.mark.slow
-def test_a_run_that_is_resumed_equals_one_that_is_not(tmp_path, monkeypatch, task):
-    """Interrupted in the middle of episodes. The same curves and weights come out."""
-    undisturbed = avf_vdn.train(short(avf_vdn, "corridor", tmp_path / "one"))
-    args = short(avf_vdn, "corridor", tmp_path / "other", checkpoint_frequency=0.0)
-    folder = interrupted(monkeypatch, avf_vdn, args, 177)
-    resume(avf_vdn, folder)
-    assert_same_run(undisturbed, folder)
 
 
 # ---- errors ---------------------------------------------------------------------------------------------------------
