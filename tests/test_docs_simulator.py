@@ -1,0 +1,130 @@
+"""The task of docs/your-own-simulator.md, as it is printed, and the page's second example."""
+
+import re
+import shlex
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import avf_qmix
+import avf_vdn
+import envs
+import play
+from tests.short_runs import short
+from tests.sync import ROOT
+from tests.test_envs import assert_same
+from tests.test_options import random_play
+from tests.test_runs import assert_same_run, interrupted, resume
+
+REASON = "pip install -e '.[simulators]'"
+pytest.importorskip("lbforaging", reason=REASON)
+pytest.importorskip("mpe2", reason=REASON)
+
+PAGE = (ROOT / "docs" / "your-own-simulator.md").read_text()
+(CODE,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.M | re.S)
+COMMANDS = [found.replace("\\\n", "") for found in re.findall(r"^    python avf_qmix\.py ((?:.*\\\n)*.*)$", PAGE, re.M)]
+FORAGING = "foraging:foraging"
+SPREAD = "docs.spread_task:spread"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tasks(tmp_path_factory):
+    """A folder on the path that holds the file; the tasks are forgotten in the end."""
+    folder = tmp_path_factory.mktemp("beside")
+    (folder / "foraging.py").write_text(CODE)
+    sys.path.insert(0, str(folder))
+    yield
+    sys.path.remove(str(folder))
+    for module, name in (("foraging", "foraging"), ("docs.spread_task", "spread")):
+        sys.modules.pop(module, None)
+        envs._TASKS.pop(name, None)
+        gymnasium.registry.pop(f"{name}-v0", None)
+
+
+def test_the_page_is_short():
+    assert len(PAGE.splitlines()) <= 150
+
+
+def test_foraging_is_what_the_page_says():
+    """Both agents beside a food load it together; the return of an episode in which nothing is left is 1."""
+    env = envs.make(FORAGING, 8)
+    assert env.macro_action_names == [["Food(0)", "Food(1)", "Food(2)", "Load", "Wait"]] * 2
+    env.reset(seed=0)
+    earned = []
+    while len(earned) < 30:
+        free = env.available[:, :, 3]
+        actions = np.where(free, 3, np.where(env.available[:, :, 0], 0, 4))  # load, the first food, or wait
+        _, _, terminations, truncations, infos = env.step(actions)
+        over = terminations | truncations
+        np.testing.assert_array_equal(terminations, infos["success"])
+        np.testing.assert_array_equal(np.isclose(env.episode_return, 1.0), infos["success"])
+        earned += env.episode_return[over].tolist()
+        env.reset(options={"reset_mask": over})
+    assert np.mean(earned) > 0.5 and max(earned) == pytest.approx(1.0)
+
+
+def test_spread_is_what_the_page_says():
+    """The script covers both landmarks; macro-actions last up to ten steps, and the simulator truncates at step 25."""
+    from docs.spread_task import scripted
+
+    env = envs.make(SPREAD, 4, horizon=40, render_mode="rgb_array")
+    _, infos = env.reset(seed=0)
+    assert all(frame.shape == (700, 700, 3) for frame in env.render())
+    for step in range(1, 26):
+        plans = np.array([scripted(sim.env.unwrapped) for sim in env.sims])
+        can_go = np.take_along_axis(infos["available"], plans[:, :, None], axis=2)[:, :, 0]
+        _, _, terminations, truncations, infos = env.step(np.where(can_go, plans, 2))
+        assert not terminations.any() and (truncations == (step == 25)).all()
+        assert env.age.max() <= 10
+    assert infos["success"].any()
+
+
+def test_spread_repeats_itself_and_foraging_is_noticed(capsys):
+    """Agents of level-based foraging begin where none stood before the reset, so after the same episode elsewhere."""
+    for env_id, says in ((SPREAD, ""), (FORAGING, "3 of 3 episodes did not repeat themselves")):
+        env, other = envs.make(env_id, 3), envs.make(env_id, 3)
+        env.reset(seed=1)
+        random_play(env, 60)
+        saved = env.save_state()
+        for sim, seed in zip(other.sims, saved["seeds"], strict=True):
+            sim.reset(int(seed))
+        other.load_state(saved)
+        said = capsys.readouterr().err
+        assert said.startswith(says) and bool(said) == bool(says)
+        if not says:
+            assert_same(random_play(env, 30), random_play(other, 30))
+    _, _, terminations, truncations, _ = other.step(other.available.argmax(2))
+    assert truncations.all() and not terminations.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", [SPREAD, FORAGING])
+def test_runs_go_on_after_an_interruption(tmp_path, monkeypatch, env_id):
+    """A run equals one that was not interrupted if its simulator repeats itself. Otherwise it comes to its end."""
+    args = short(avf_vdn, env_id, tmp_path / "one", checkpoint_frequency=0.0)
+    folder = interrupted(monkeypatch, avf_vdn, args, 177)
+    resume(avf_vdn, folder)
+    assert torch.load(folder / "last.pt", weights_only=True)["step"] == 1_200
+    if env_id == SPREAD:
+        undisturbed = avf_vdn.train(short(avf_vdn, env_id, tmp_path / "other"))
+        assert_same_run(undisturbed, folder)
+
+
+@pytest.mark.slow
+def test_the_page_as_it_is_printed(tmp_path, monkeypatch, capsys):
+    """Both commands, in a tenth of the time, and a timeline of what the first has trained."""
+    for command, env_id in zip(COMMANDS, (FORAGING, SPREAD), strict=True):
+        flags = [*shlex.split(command), f"--runs-dir={tmp_path}"]
+        args = avf_qmix.parse_args(flags)
+        assert args.env == env_id
+        args.total_timesteps //= 20
+        args.learning_starts = 1_000
+        args.eval_episodes = 4
+        folder = avf_qmix.train(args)
+        assert torch.load(folder / "last.pt", weights_only=True)["step"] == args.total_timesteps
+        play.main([str(folder), "--episodes=2", f"--timeline={tmp_path}/team.png"])
+        assert (tmp_path / "team.png").stat().st_size > 10_000
+    assert "2 greedy episodes" in capsys.readouterr().out
