@@ -98,12 +98,13 @@ def test_spread_repeats_itself_and_foraging_is_noticed(capsys):
 @pytest.mark.parametrize("env_id", [SPREAD, FORAGING])
 def test_runs_go_on_after_an_interruption(tmp_path, monkeypatch, env_id):
     """A run equals one that was not interrupted if its simulator repeats itself. Otherwise it comes to its end."""
-    args = short(avf_vdn, env_id, tmp_path / "one", checkpoint_frequency=0.0)
-    folder = interrupted(monkeypatch, avf_vdn, args, 177)
+    options = dict(total_timesteps=480, eval_frequency=240, eval_episodes=1)
+    args = short(avf_vdn, env_id, tmp_path / "one", checkpoint_frequency=0.0, **options)
+    folder = interrupted(monkeypatch, avf_vdn, args, 70)
     resume(avf_vdn, folder)
-    assert torch.load(folder / "last.pt", weights_only=True)["step"] == 1_200
+    assert torch.load(folder / "last.pt", weights_only=True)["step"] == 480
     if env_id == SPREAD:
-        undisturbed = avf_vdn.train(short(avf_vdn, env_id, tmp_path / "other"))
+        undisturbed = avf_vdn.train(short(avf_vdn, env_id, tmp_path / "other", **options))
         assert_same_run(undisturbed, folder)
 
 
