@@ -28,9 +28,11 @@ import json
 import sys
 import time
 from collections import deque
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
+from zipfile import ZipFile
 
 import numpy as np
 import torch
@@ -49,11 +51,11 @@ AT_MOST_1 = ("learning_rate", "gamma", "polyak", "end_e", "td_lambda", "hysteres
 class Args:
     env: str = "wtd-s"  # task, one of envs.IDS or "module:id", see docs/your-own-task.md
     seed: int = 1  # of networks, exploration, replay and environments; at least 0
-    total_timesteps: int = 300_000  # environment steps of the run, over all environments
+    total_timesteps: int = 250_000  # environment steps of the run, over all environments
     num_envs: int = 32  # environments stepped side by side
     eval_frequency: int = 10_000  # environment steps between greedy evaluations
     eval_episodes: int = 20  # episodes of an evaluation, freshly seeded each time
-    checkpoint_frequency: float = 60.0  # seconds between checkpoints, from which --resume continues exactly
+    checkpoint_frequency: float = 60.0  # seconds between checkpoints; --resume goes on exactly
     runs_dir: str = "runs"  # folder in which each run makes its own
     resume: str | None = None  # folder of an interrupted run to go on with, with its own settings
     device: Literal["cpu", "cuda"] = "cpu"  # where networks learn and act
@@ -67,22 +69,19 @@ class Args:
     batch_size: int = 16  # episodes in an update
     polyak: float = 0.995  # share of the target network kept at each update; higher is slower
     learning_starts: int = 5_000  # environment steps with random macro-actions, before the first update
-    exploration_timesteps: int = 150_000  # environment steps over which epsilon then falls from 1
+    exploration_timesteps: int = 60_000  # environment steps over which epsilon then falls from 1
     end_e: float = 0.05  # final epsilon
     train_frequency: int = 64  # environment steps per update
     max_grad_norm: float = 10.0  # the gradient is scaled down to this norm
     obs_scale: float = 1.0  # factor on macro-observations in the networks; larger separates similar ones
     reward_scale: float = 0.1  # factor on rewards inside the loss; logged returns are unscaled
     td_lambda: float = 0.8  # lambda of Q(lambda) returns, in [0, 1]; 0 bootstraps as early as possible
-    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps as that
+    hysteresis: float = 1.0  # factor on negative TD errors; rises to 1 after epsilon's fall, in as many steps
     hidden_size: int = 64  # width of the networks' layers
     ongoing: Literal["update", "detach", "zero"] = "update"  # busy agents' utilities learn, are constants, or are 0
     mixer_state: Literal["joint", "single", "real", "real-both", "decision"] = "joint"  # see mixer_states
 
     def __post_init__(self):
-        problem = envs.problem(self.env)
-        if problem:
-            raise SystemExit(f"--env: {problem}")
         for name, value in vars(self).items():
             kind = type(getattr(Args, name))  # of the default
             low = 1 if kind is int and name not in ("seed", "learning_starts") else 0
@@ -101,10 +100,12 @@ DEFAULTS = {
     ),
     "wtd-t": dict(
         total_timesteps=800_000,
+        exploration_timesteps=150_000,
         train_frequency=128,
     ),
     "ct-": dict(
         total_timesteps=600_000,
+        exploration_timesteps=150_000,
         num_envs=128,
         eval_episodes=400,
         train_frequency=256,
@@ -125,8 +126,7 @@ class AgentLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(n_agents, 1, outputs).uniform_(-bound, bound))
 
     def forward(self, x):
-        flat = x.flatten(1, -2)  # [n, all in between, inputs]
-        return torch.baddbmm(self.bias, flat, self.weight).unflatten(1, x.shape[1:-1])
+        return torch.baddbmm(self.bias, x.flatten(1, -2), self.weight).unflatten(1, x.shape[1:-1])
 
 
 class Agents(nn.Module):
@@ -143,8 +143,8 @@ class Agents(nn.Module):
         self.encoder = AgentLinear(n_agents, obs_size + n_actions, hidden_size)
         self.input_layer = AgentLinear(n_agents, hidden_size, 3 * hidden_size)
         bound = hidden_size**-0.5
-        hidden_weight = torch.empty(n_agents, hidden_size, 3 * hidden_size)  # without a bias of its own
-        self.hidden_weight = nn.Parameter(hidden_weight.uniform_(-bound, bound))
+        weight = torch.empty(n_agents, hidden_size, 3 * hidden_size).uniform_(-bound, bound)
+        self.hidden_weight = nn.Parameter(weight)  # without a bias of its own
         self.head = AgentLinear(n_agents, hidden_size, hidden_size)
         self.output = AgentLinear(n_agents, hidden_size, n_actions)
 
@@ -156,8 +156,7 @@ class Agents(nn.Module):
     def forward(self, obs, previous, hidden):
         """Utilities float32 [n, B, L, A] at the L decisions of each agent in each episode, and the last hidden states.
 
-        obs: float32 [n, B, L, d]. previous: int64 [n, B, L], the agent's macro-action before, -1 for none. hidden:
-        float32 [n, B, H].
+        obs: float32 [n, B, L, d]. previous: int64 [n, B, L], the macro-action before, or -1. hidden: float32 [n, B, H].
         """
         one_hot = nn.functional.one_hot(previous + 1, self.n_actions + 1)[..., 1:]  # zeros for none
         inputs = torch.cat([self.obs_scale * obs, one_hot], -1)
@@ -224,10 +223,7 @@ class QMIXMixer(nn.Module):
 
 
 class ReplayBuffer:
-    """Episodes as rows: those that run in the N environments, and the last `capacity` that have ended.
-
-    A row is a record of a NumPy structured array.
-    """
+    """The running episodes of N environments and the last `capacity` that ended. A row is a record of a NumPy array."""
 
     def __init__(self, env, capacity):
         n_agents, obs_size = env.single_observation_space.shape
@@ -253,12 +249,11 @@ class ReplayBuffer:
         """
         e = np.flatnonzero(free.any(1))  # the environments that get a row
         k = self.running_rows[e]  # and its number
-        since_before = self.running["since"][e, k - 1]  # not used at row 0, where all agents are free
         rows = np.zeros(len(e), self.running.dtype)
         rows["obs"] = obs[e]
         rows["available"] = infos["available"][e]
         rows["action"] = actions[e]
-        rows["since"] = np.where(free[e], k[:, None], since_before)
+        rows["since"] = np.where(free[e], k[:, None], self.running["since"][e, k - 1])  # at row 0 all are free
         rows["state"] = infos["state"][e]
         rows["last_state"] = infos["state"][e]  # stays so at a final row
         rows["discount"] = 1.0
@@ -278,7 +273,7 @@ class ReplayBuffer:
         self.running[latest] = rows
 
     def end_episodes(self, over, obs, infos):
-        """Moves episodes that are over, bool [N], to `ended`, after a final row, at which macro_done holds for all."""
+        """Ends episodes that are over, bool [N], with a row whose actions are not used, and moves them to `ended`."""
         self.begin_rows(obs, infos, infos["macro_action"], free=over[:, None] & infos["macro_done"])
         for e in np.flatnonzero(over):
             self.ended.append(self.running[e, : self.running_rows[e]].copy())
@@ -289,21 +284,17 @@ class ReplayBuffer:
         return [self.ended[number] for number in rng.integers(len(self.ended), size=batch_size)]
 
     def state_dict(self):
-        """The rows that were written, for each episode as a tensor of bytes."""
+        """The rows that were written, for each episode as a tensor of bytes. The running episodes come first."""
         running = [self.running[e, :length] for e, length in enumerate(self.running_rows)]
-        return {
-            "running": [torch.from_numpy(rows.view(np.uint8)) for rows in running],
-            "ended": [torch.from_numpy(rows.view(np.uint8)) for rows in self.ended],
-        }
+        return [torch.from_numpy(rows.view(np.uint8)) for rows in [*running, *self.ended]]
 
     def load_state_dict(self, saved):
         """Goes on with what `state_dict` returned."""
-        for e, in_bytes in enumerate(saved["running"]):
-            rows = in_bytes.numpy().view(self.running.dtype)
+        episodes = [in_bytes.numpy().view(self.running.dtype) for in_bytes in saved]
+        for e, rows in enumerate(episodes[: len(self.running)]):
             self.running[e, : len(rows)] = rows
             self.running_rows[e] = len(rows)
-        for in_bytes in saved["ended"]:
-            self.ended.append(in_bytes.numpy().view(self.running.dtype))
+        self.ended.extend(episodes[len(self.running) :])
 
 
 def make_batch(episodes, device="cpu"):
@@ -324,7 +315,7 @@ def make_batch(episodes, device="cpu"):
     batch["previous"] = np.where(since > 0, previous, -1)
     episode = np.arange(len(episodes))[:, None, None]
     batch["macro_state"] = batch["state"][episode, since]  # [B, T, n, S]
-    return {name: torch.from_numpy(array).to(device) for name, array in batch.items()}
+    return {name: torch.as_tensor(array, device=device) for name, array in batch.items()}
 
 
 def mixer_states(batch, kind):
@@ -332,18 +323,18 @@ def mixer_states(batch, kind):
 
     Both are float32 [B, T, S], or [B, T, n * S] for "joint". The last row's Q is never used.
     """
-    state, last_state, macro_state = (batch[name] for name in ("state", "last_state", "macro_state"))
-    joint = macro_state.flatten(2)
+    state = batch["state"]
+    last_state = batch["last_state"]
+    joint = batch["macro_state"].flatten(2)
     agent = batch["free"].roll(-1, 1).int().argmax(2)  # [B, T], the first that is free at the next row
-    single = macro_state.take_along_dim(agent[..., None, None], 2)[:, :, 0]
-    kinds = {
+    single = batch["macro_state"].take_along_dim(agent[..., None, None], 2)[:, :, 0]
+    return {
         "joint": (joint, joint),  # the macro-states of all agents, the paper's method
-        "single": (single, state),  # the macro-state of an agent free at the next row, which is `state` there
+        "single": (single, state),  # that of an agent free at the next row, where it is `state`
         "real": (last_state, state),  # the state a step before the next row; for Q' the row's state
-        "real-both": (last_state, last_state),  # the state a step before the next row for both
+        "real-both": (last_state, last_state),  # for Q', too, a step before the row after its own
         "decision": (state, state),  # the row's state for both
-    }
-    return kinds[kind]
+    }[kind]
 
 
 def td_loss(utilities, target_utilities, mixer, target_mixer, batch, args, hysteresis=1.0):
@@ -357,8 +348,8 @@ def td_loss(utilities, target_utilities, mixer, target_mixer, batch, args, hyste
     if args.ongoing == "detach":
         utilities = torch.where(free, utilities, utilities.detach())
     if args.ongoing == "zero":
-        utilities = torch.where(free, utilities, 0.0)
-        target_utilities = torch.where(free, target_utilities, 0.0)
+        utilities = utilities * free
+        target_utilities = target_utilities * free
     state, target_state = mixer_states(batch, args.mixer_state)
     q = mixer(utilities, batch["action"], available, state)[:, :-1]  # [B, T - 1]
     with torch.no_grad():
@@ -382,11 +373,11 @@ def act(agents, obs, infos, hidden, epsilon=0.0, rng=None):
     """
     free = infos["macro_done"]
     available = infos["available"]
-    own_obs = torch.from_numpy(obs).to(hidden.device).transpose(0, 1)[:, :, None]  # [n, N, 1, d]
-    previous = torch.from_numpy(infos["macro_action"].T[..., None]).to(hidden.device)
+    own_obs = torch.as_tensor(obs, device=hidden.device).transpose(0, 1)[:, :, None]  # [n, N, 1, d]
+    previous = torch.as_tensor(infos["macro_action"].T[..., None], device=hidden.device)
     with torch.no_grad():
         utilities, new_hidden = agents(own_obs, previous, hidden)
-    is_free = torch.from_numpy(free.T[..., None]).to(hidden.device)  # [n, N, 1]
+    is_free = torch.as_tensor(free.T[..., None], device=hidden.device)  # [n, N, 1]
     hidden = torch.where(is_free, new_hidden, hidden)
     utilities = utilities[:, :, 0].transpose(0, 1).cpu().numpy()  # [N, n, A]
     actions = np.where(available, utilities, -np.inf).argmax(2)
@@ -402,19 +393,16 @@ def evaluate(agents, env, gamma, seed):
     obs, infos = env.reset(seed=seed)
     hidden = agents.start(env.num_envs)
     running = np.ones(env.num_envs, bool)
-    names = ("return", "discounted_return", "length", "success")
-    result = {name: np.zeros(env.num_envs) for name in names}
-    step = 0
+    result = dict.fromkeys(("return", "discounted_return", "length", "success"), 0.0)  # arrays [N] soon
     while running.any():
         actions, hidden = act(agents, obs, infos, hidden)
         obs, rewards, terminations, truncations, infos = env.step(actions)
         result["return"] += running * rewards
-        result["discounted_return"] += running * gamma**step * rewards
+        result["discounted_return"] += running * gamma ** result["length"] * rewards
         result["length"] += running
         result["success"] += running & infos["success"]  # true in one step of an episode at most
         over = terminations | truncations
         running &= ~over
-        step += 1
         obs, infos = env.reset(options={"reset_mask": over})  # the next ones do not count
         hidden[:, over] = 0.0
     return result
@@ -422,11 +410,19 @@ def evaluate(agents, env, gamma, seed):
 
 def make_learner(args, env):
     """The agents' networks and the mixer, as one module on the device."""
-    obs_size = env.single_observation_space.shape[1]
-    agents = Agents(env.n_agents, max(env.n_actions), obs_size, args.hidden_size, args.obs_scale)
+    agents = Agents(env.n_agents, max(env.n_actions), max(env.obs_sizes), args.hidden_size, args.obs_scale)
     state_size = env.state_size * env.n_agents if args.mixer_state == "joint" else env.state_size
     mixer = QMIXMixer(env.n_agents, state_size)
     return nn.ModuleDict({"agents": agents, "mixer": mixer}).to(args.device)
+
+
+@contextmanager
+def one_line(message):
+    """An error in its block ends the program with one line: the message and the first sentence of the error."""
+    try:
+        yield
+    except Exception as error:
+        raise SystemExit(f"{message}: {error}".partition(". ")[0].splitlines()[0]) from None
 
 
 def train(args):
@@ -439,40 +435,40 @@ def train(args):
     torch.manual_seed(network_seed)
     explore_rng = np.random.default_rng(explore_seed)
     replay_rng = np.random.default_rng(replay_seed)
-    env = envs.make(args.env, args.num_envs)
-    eval_env = envs.make(args.env, args.eval_episodes)
+    with one_line("--env"):
+        env = envs.make(args.env, args.num_envs)
+        eval_env = envs.make(args.env, args.eval_episodes)
     learner = make_learner(args, env)
+    agents = learner["agents"]
+    mixer = learner["mixer"]
     target = copy.deepcopy(learner).requires_grad_(False)  # the target networks, without gradients
-    optimizer = torch.optim.Adam(learner.parameters(), lr=args.learning_rate, fused=True)
+    optimizer = torch.optim.Adam(learner.parameters(), args.learning_rate, fused=True)
     buffer = ReplayBuffer(env, args.buffer_size)
-    parts = {
-        "learner": learner,
-        "target": target,
-        "optimizer": optimizer,
-        "buffer": buffer,
-    }
+    parts = {"learner": learner, "target": target, "optimizer": optimizer, "buffer": buffer}
     obs, infos = env.reset(seed=env_seed)
-    hidden = learner["agents"].start(args.num_envs)
+    hidden = agents.start(args.num_envs)
     step = 0
-    updates = 0
     best_return = -np.inf
     run_name = f"{args.env}__{ALGORITHM}__{args.seed}__{time.time_ns() // 1000}".replace(":", "-")
-    folder = Path(args.resume or f"{args.runs_dir}/{run_name}")
-    if args.resume:
+    if args.resume is not None:
+        folder = Path(args.resume)
         saved = load(folder / "checkpoint.pt")
-        for name, part in parts.items():
-            part.load_state_dict(saved[name])
-        obs, infos = env.load_state(saved["env"])
-        hidden = saved["hidden"].to(args.device)
-        explore_rng.bit_generator.state, replay_rng.bit_generator.state = saved["rngs"]
-        step, updates, best_return = saved["progress"]
+        with one_line(f"cannot resume {folder}"):  # the task is not what it was, or the file was edited
+            for name, part in parts.items():
+                part.load_state_dict(saved[name])
+            obs, infos = env.load_state(saved["env"])
+            hidden = saved["hidden"].to(args.device)
+            explore_rng.bit_generator.state, replay_rng.bit_generator.state = saved["rngs"]
+            step, best_return = saved["progress"]
     else:
+        folder = Path(args.runs_dir) / run_name
         folder.mkdir(parents=True)
         (folder / "args.json").write_text(json.dumps({"algorithm": ALGORITHM, **asdict(args)}, indent=2))
     if args.track:
-        import wandb  # optional: pip install -e '.[track]'
+        with one_line("--track"):
+            import wandb  # optional: pip install -e '.[track]'
 
-        wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
+            wandb.init(name=folder.name, id=folder.name, resume="allow", config=asdict(args), sync_tensorboard=True)
     writer = SummaryWriter(folder, purge_step=step + 1)  # drops what was logged after the checkpoint
     print(folder, flush=True)
     bar = tqdm(total=args.total_timesteps, initial=step, disable=None)  # no bar without a terminal
@@ -482,7 +478,7 @@ def train(args):
         # ---- act: one time step in every environment ----
         phase = (step - args.learning_starts) / args.exploration_timesteps  # epsilon falls while this is in [0, 1]
         epsilon = np.interp(phase, [0, 1], [1.0, args.end_e])
-        actions, hidden = act(learner["agents"], obs, infos, hidden, epsilon, explore_rng)
+        actions, hidden = act(agents, obs, infos, hidden, epsilon, explore_rng)
         buffer.begin_rows(obs, infos, actions, free=infos["macro_done"])
         state = infos["state"]
         obs, rewards, terminations, truncations, infos = env.step(actions)
@@ -504,30 +500,27 @@ def train(args):
                 optimizer.param_groups[0]["lr"] = args.learning_rate * max(0.0, 1 - step / args.total_timesteps)
             hysteresis = np.interp(phase, [1, 2], [args.hysteresis, 1.0])
             batch = make_batch(buffer.sample(args.batch_size, replay_rng), args.device)
-            utilities = utilities_at_rows(learner["agents"], batch)
+            utilities = utilities_at_rows(agents, batch)
             target_utilities = utilities_at_rows(target["agents"], batch)
-            loss, q, _ = td_loss(
-                utilities, target_utilities, learner["mixer"], target["mixer"], batch, args, hysteresis
-            )
+            loss, q, _ = td_loss(utilities, target_utilities, mixer, target["mixer"], batch, args, hysteresis)
             optimizer.zero_grad()
             loss.backward()
             grad_norm = nn.utils.clip_grad_norm_(learner.parameters(), args.max_grad_norm)
+            if not grad_norm.isfinite():
+                raise SystemExit(f"the gradient at step {step} is not finite: {folder} keeps the models before it")
             optimizer.step()
             for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
                 slow.lerp_(fast.detach(), 1 - args.polyak)
-            updates += 1
-            if updates % 100 == 0:
+            if not step // args.train_frequency % 100:  # one in a hundred
                 writer.add_scalar("losses/td_loss", loss, step)
                 writer.add_scalar("losses/q_values", q.mean(), step)
-                writer.add_scalar("losses/grad_norm", grad_norm, step)
 
         # ---- evaluate at each multiple of eval_frequency that was just passed; log, save ----
         if step % args.eval_frequency < args.num_envs or step >= args.total_timesteps:
-            episodes = evaluate(learner["agents"], eval_env, args.gamma, seed=eval_seed + step)
+            episodes = evaluate(agents, eval_env, args.gamma, eval_seed + step)
             result = {name: values.mean().item() for name, values in episodes.items()}
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)
-            writer.add_scalar("charts/epsilon", epsilon, step)
             bar.write(f"step {step}: greedy return {result['return']:.2f}, success {result['success']:.2f}", sys.stderr)
             model = dict(step=step, networks=learner.state_dict(), **result)
             save(folder / "last.pt", args, **model)
@@ -540,50 +533,61 @@ def train(args):
                 folder / "checkpoint.pt",
                 args,
                 **{name: part.state_dict() for name, part in parts.items()},
-                env={name: torch.from_numpy(array) for name, array in env.save_state().items()},
+                env=env.save_state(),
                 hidden=hidden,
                 rngs=(explore_rng.bit_generator.state, replay_rng.bit_generator.state),
-                progress=(step, updates, best_return),
+                progress=(step, best_return),
             )
             saved_at = time.monotonic()
 
     bar.close()
     writer.close()
-    (folder / "checkpoint.pt").unlink(missing_ok=True)
+    (folder / "checkpoint.pt").unlink()
     return folder
 
 
 def save(path, args, **content):
-    """Writes beside the file and swaps, so that a kill at any moment leaves the old file or the new one."""
-    torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, f"{path}.new")
-    Path(f"{path}.new").replace(path)
+    """Writes beside the file and swaps, so that a kill or a full disk leaves the old file or the new one."""
+    new = Path(f"{path}.new")
+    with one_line(f"cannot write {path}"):
+        try:
+            torch.save({"algorithm": ALGORITHM, "args": asdict(args), **content}, new)
+            new.replace(path)
+        finally:
+            new.unlink(missing_ok=True)  # half a file, where the disk is full
 
 
 def load(path):
-    """What `save` wrote, on the CPU."""
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)  # runs no code of the file
-        if saved["algorithm"] != ALGORITHM:
-            raise SystemExit(f"{path} is of {saved['algorithm']}, not of {ALGORITHM}")
-        Args(**saved["args"])  # raises TypeError if a setting is of another version
-        return saved
-    except Exception as error:  # a damaged file raises errors of many classes
-        raise SystemExit(f"cannot read {path}: {error}".splitlines()[0]) from None
+    """What `save` wrote, on the CPU. Nothing that the file names is run or imported."""
+    with one_line(f"cannot read {path}"):
+        with ZipFile(path) as archive:
+            if archive.testzip():
+                raise ValueError("its checksums are wrong")
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        if saved["algorithm"] != ALGORITHM or saved["args"].keys() != vars(Args()).keys():
+            raise ValueError(f"it is of {saved['algorithm']}, or of another version of {ALGORITHM}")
+    return saved
 
 
 def parse_args(argv=None):
     """The task's defaults, overridden by the command line, or with --resume the settings of that run."""
-    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    peek = argparse.ArgumentParser(add_help=False)
     peek.add_argument("--env")
     peek.add_argument("--resume")
     known, others = peek.parse_known_args(argv)
-    if known.resume:
-        if known.env or others:
-            raise SystemExit("--resume goes on with the run's own settings: no other flag can be given with it")
-        saved = load(Path(known.resume) / "checkpoint.pt")
-        return Args(**{**saved["args"], "resume": known.resume})
+    if known.resume is not None:
+        checkpoint = Path(known.resume) / "checkpoint.pt"
+        if not checkpoint.exists():
+            raise SystemExit(f"{known.resume} has no checkpoint: it is finished, nothing to resume, or it is not a run")
+        saved = load(checkpoint)["args"]
+        with one_line(f"cannot resume {known.resume}"):
+            own_task = saved["env"] if ":" in saved["env"] else None  # no file decides which module is imported
+            if others or known.env != own_task:
+                raise ValueError("no other flag can be given, but a task of your own has to be: --env module:id")
+            saved["resume"] = known.resume
+            return Args(**saved)
     env = known.env or Args.env
-    defaults = {}
+    defaults = envs.defaults(env, Args)  # of a task of your own, if it brings some
     for beginning, values in DEFAULTS.items():
         if env.startswith(beginning):
             defaults = values
@@ -594,8 +598,8 @@ if __name__ == "__main__":
     args = parse_args()
     try:
         train(args)
-    except (OSError, ImportError) as error:  # a folder that cannot be written, a full disk, no wandb
+    except (OSError, envs.TaskError) as error:  # a folder that cannot be written, a task that goes wrong
         raise SystemExit(error) from None
     except KeyboardInterrupt:
-        print("stopped; --resume with the run's folder goes on from its last checkpoint", file=sys.stderr)
+        print("stopped; --resume with its folder goes on from its last checkpoint", file=sys.stderr)
         sys.exit(130)

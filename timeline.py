@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from math import ceil
 from textwrap import wrap
+from unicodedata import east_asian_width
 
 import numpy as np
 from matplotlib import rc_context, style
@@ -15,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from envs.rendering import ALARM, ARM, GREEN_DARK, INK, MUTED, WHITE, agent_colours
+from envs.rendering import ALARM, ARM, GREEN_DARK, INK, MUTED, WHITE, agent_colours, find_font
 
 WIDTH = 800  # of the figure
 LEFT = 80  # from the left edge of the figure to the strips
@@ -146,7 +147,7 @@ def describe(episode, row, last):
 def shorten(name):
     """A macro-action's initials and arguments, or two letters: Pass-to-M(0) is PtM(0), Go-TR is GTR, Stay is St."""
     stem, bracket, arguments = name.partition("(")
-    words = stem.split("-")
+    words = [word for word in stem.split("-") if word]
     initials = [word if word.isupper() else word[:1] for word in words]
     short = "".join(initials) if len(words) > 1 else stem[:2]
     return short + bracket + arguments
@@ -166,10 +167,16 @@ def fold(words):
     return wrap(words, 140, break_on_hyphens=False)
 
 
-def write(axes, x, y, words, **options):
+def wide(words):
+    """How many letters of the Latin alphabet are as wide as the words. Those of East Asia are twice as wide."""
+    return sum(2 if east_asian_width(letter) in "WF" else 1 for letter in words)
+
+
+def write(axes, x, y, words, family="sans-serif", **options):
     """Writes words at (x, y), where y is the middle of their height. The options are those of matplotlib's text."""
     options = {"size": SMALL, "color": INK, "va": "center", **options}
-    axes.text(x, y, words, **options)
+    families = [family, find_font(str(words)).name]  # the second is for letters that the first lacks
+    axes.text(x, y, words, family=families, parse_math=False, **options)  # a name may contain dollar signs
 
 
 # ---- strips ---------------------------------------------------------------------------------------------------------
@@ -243,7 +250,7 @@ class Strip:
     def write_names(self, name, bars, y):
         """Writes the name that successive bars have in common: below each of them if there is room, otherwise once."""
         shortest = min(bar.end - bar.start for bar in bars)
-        if len(name) <= self.letters(shortest):
+        if wide(name) <= self.letters(shortest):
             for bar in bars:
                 self.write_name(name, [bar], y)
         else:
@@ -283,7 +290,7 @@ class Strip:
 
         If it abbreviates the name, the name is added to `shortened`.
         """
-        words = next((words for words in candidates if len(words) <= self.letters(steps)), "")
+        words = next((words for words in candidates if wide(words) <= self.letters(steps)), "")
         if shorten(name) in words and name not in words:
             self.shortened.add(name)
         return words

@@ -1,10 +1,13 @@
 """What is kept of runs: a row for each in runs.csv and its evaluations in evaluations.csv, both plain text.
 
 KEY says which run it is. flags: those that differ from the script's defaults for the task, as "name=value name=value".
-checksum: of the script and of envs/*.py, because changed code makes another run (`checksum`). A script cannot tell its
+checksum: of the code that a run executes, because changed code makes another run (`checksum`). A script cannot tell its
 own, so the sweep leaves ORIGIN beside its run folders; of a run that was started by hand it is not known, and empty.
 """
 
+import ast
+import contextlib
+import csv
 import fcntl
 import hashlib
 import importlib
@@ -15,7 +18,8 @@ import platform
 import re
 import subprocess
 import sys
-from dataclasses import asdict
+import tempfile
+from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -23,6 +27,7 @@ import pandas as pd
 from tensorboard.backend.event_processing.event_file_loader import LegacyEventFileLoader
 from tensorboard.compat.proto.event_pb2 import SessionLog
 from torch.backends.cpu import get_cpu_capability
+from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmark" / "results"
@@ -39,30 +44,61 @@ def scripts():
 
 
 def load_script(algorithm):
-    """The module of a script."""
+    """The module of a script. Raises ValueError for any other module: its name may come from a file."""
+    if algorithm not in scripts():
+        raise ValueError(f"{algorithm!r} is none of the scripts {' '.join(scripts())}")
     if str(ROOT) not in sys.path:
         sys.path.insert(0, str(ROOT))
     return importlib.import_module(algorithm)
 
 
-def flags_of(algorithm, arguments):
-    """The flags that make a script's arguments, a dict, of its defaults; without what has a column of its own."""
-    usual = asdict(load_script(algorithm).parse_args([f"--env={arguments['env']}"]))
-    usual |= {name: arguments.get(name) for name in ("algorithm", "seed", "runs_dir")}
+def values_of(algorithm, env):
+    """The values in force for a script on a task: {field of Args: value}. A task "module:id" is imported."""
+    return asdict(load_script(algorithm).parse_args([f"--env={env}"]))
+
+
+def flags_of(usual, arguments):
+    """The flags that make a script's arguments, a dict, of the usual ones; without what has a column of its own."""
+    usual = usual | {name: arguments.get(name) for name in ("algorithm", "env", "seed", "runs_dir")}
     return " ".join(f"{name}={value}" for name, value in arguments.items() if usual.get(name, ...) != value)
 
 
-def checksum(algorithm, env):
-    """Of all that a run executes: the script, with the values in force on the task for those it has, and envs/*.py.
+def syntax(path):
+    """The syntax tree of a module, so without comments, and without docstrings."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(getattr(node, "body", None), list):
+            texts = [part for part in node.body if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant)]
+            node.body = [part for part in node.body if part not in texts]
+    return tree
 
-    So a value of Args or DEFAULTS that is changed leaves the recorded runs of tasks that have another what they are.
+
+def checksum(algorithm, env):
+    """Of all that a run executes, whatever its comments and docstrings say: the script, with the values in force on the
+    task, the task's domain and keywords, and the modules that define it.
+
+    These are the domain's, that of "module:id", and what they import from envs/, but for rendering.py, which draws. So
+    a new task, or another value for another task, leaves the recorded runs what they are.
     """
-    values = asdict(load_script(algorithm).parse_args([f"--env={env}"]))
-    field = rf"^(    (?:{'|'.join(values)}): .+?) = (?s:.*?)(?=  # )"  # of Args, no other annotated name
-    script = re.sub(field, r"\1", (ROOT / f"{algorithm}.py").read_text(), flags=re.M)
-    script = re.sub(r"^DEFAULTS = \{.*?^\}", repr(values), script, flags=re.S | re.M)
-    code = [script.encode(), *(path.read_bytes() for path in sorted((ROOT / "envs").glob("*.py")))]
-    return hashlib.sha256(b"".join(code)).hexdigest()[:12]
+    code = [repr(values_of(algorithm, env))]
+    for node in syntax(ROOT / f"{algorithm}.py").body:
+        if isinstance(node, ast.ClassDef) and node.name == "Args":  # its fields are among the values
+            node.body = [part for part in node.body if not isinstance(part, ast.AnnAssign)]
+        if not ast.unparse(node).startswith("DEFAULTS ="):
+            code.append(ast.unparse(node))
+    envs = importlib.import_module("envs")
+    domain, keywords = envs._find(env)[:2]
+    code.append(re.sub(r" at 0x\w+", "", repr((domain, keywords))))  # without the addresses of functions
+    names = {domain.__module__, env.rpartition(":")[0] or domain.__module__}
+    modules, todo = {}, [Path(sys.modules[name].__file__) for name in names]
+    while todo:
+        path = todo.pop()
+        if path not in modules and path.name != "rendering.py":
+            modules[path] = ast.unparse(syntax(path))
+            imports = " ".join(re.findall(r"^ *(?:from|import) envs\b.*", modules[path], re.M))
+            files = [Path(envs.__file__).with_name(f"{word}.py") for word in re.findall(r"\w+", imports)]
+            todo += filter(Path.exists, files)
+    return hashlib.sha256("\n".join([*code, *sorted(modules.values())]).encode()).hexdigest()[:12]
 
 
 def commit():
@@ -78,10 +114,39 @@ def processor():
     return f"{names[0] if names else platform.processor()}, {get_cpu_capability()}"
 
 
+def folder(text):
+    """The path that a word of a command line names."""
+    if not text:
+        raise ValueError("an empty word, not a folder")
+    return Path(text)
+
+
+def make_folder(place):
+    """Makes a folder, if it is not there; raises OSError if nothing can be written into it."""
+    place.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=place).close()
+
+
+def tell(line):
+    """Prints a line to stderr. It may be closed, full or of a terminal that is gone: that is no reason to stop."""
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError):
+            tqdm.write(line, sys.stderr)
+
+
+def replace(path, write):
+    """Lets `write` make a file beside the path and swaps: what fails or is killed leaves the old one."""
+    new = Path(f"{path}.new")
+    try:
+        write(new)
+        os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)
+
+
 def replace_text(path, text):
-    """Writes a file so that a kill at any moment leaves the old one or the new one."""
-    Path(f"{path}.new").write_text(text)
-    os.replace(f"{path}.new", path)
+    """Writes a file of text as `replace` does."""
+    replace(path, lambda new: new.write_text(text))
 
 
 def describe(folder):
@@ -90,7 +155,12 @@ def describe(folder):
     about = {name: str(arguments[name]) for name in ("algorithm", "env", "seed")}
     if (folder.parent / ORIGIN).exists():
         return about | json.loads((folder.parent / ORIGIN).read_text())
-    flags = flags_of(about["algorithm"], arguments)
+    script = load_script(about["algorithm"])
+    usual = {field.name: field.default for field in fields(script.Args)}
+    # A module that a file names is not imported, so the values of a task of one's own are flags
+    if about["env"] in importlib.import_module("envs").IDS:
+        usual = values_of(about["algorithm"], about["env"])
+    flags = flags_of(usual, arguments)
     return about | {"flags": flags, "variant": flags, "checksum": "", "commit": "", "processor": ""}
 
 
@@ -125,13 +195,27 @@ def read_folder(folder):
 
 
 def load(place):
-    """The runs and the evaluations recorded in a folder: two DataFrames of text, empty where there is no file."""
+    """The runs and the evaluations recorded in a folder: two DataFrames of text, empty where there is no file.
+
+    Raises:
+        OSError: a file cannot be read.
+        ValueError: a file has other columns, or a line that is no row, such as the marks of a merge conflict.
+    """
     tables = []
     for name, columns in TABLES.items():
-        table = pd.DataFrame(columns=columns, dtype=str)
+        lines = [columns]
         if (place / name).exists():
-            table = pd.read_csv(place / name, dtype=str, keep_default_na=False, usecols=columns)
-        tables.append(table[columns])
+            try:
+                with open(place / name, newline="") as file:
+                    lines = list(csv.reader(file, strict=True))
+            except csv.Error as error:
+                raise ValueError(f"{name}: {error}") from None
+        if not lines or lines[0] != columns:
+            raise ValueError(f"{name} must begin with the columns {','.join(columns)}")
+        for number, line in enumerate(lines, 1):
+            if len(line) != len(columns):
+                raise ValueError(f"line {number} of {name} is no row of {len(columns)} columns: {','.join(line)[:40]}")
+        tables.append(pd.DataFrame(lines[1:], columns=columns, dtype=str))
     return tables
 
 
@@ -139,7 +223,7 @@ def load_runs(place):
     """What `read_folder` returned of each run that is recorded in a folder."""
     runs, evaluations = load(place)
     found = dict(list(evaluations.groupby(KEY)))
-    return [(run, found[key]) for run in runs.to_dict("records") if (key := tuple(run[k] for k in KEY)) in found]
+    return [(run, found.get(tuple(run[name] for name in KEY), evaluations[:0])) for run in runs.to_dict("records")]
 
 
 def add(place, run, evaluations):

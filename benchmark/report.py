@@ -4,15 +4,14 @@
     python benchmark/report.py runs -o report     of run folders
 
 RUNS are folders with a runs.csv (see record.py), run folders, or folders of them. Only finished runs count. A section
-of paper.json says which algorithms and variants it compares on which tasks; what is in none of them comes last. A
-section that is "older" shows runs of older code, whose flags or defaults are no longer there: the grid does not make
-them.
+of paper.json says which algorithms and variants it compares on which tasks; what is in none of them comes last.
 """
 
 import argparse
 import itertools
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -33,7 +32,8 @@ PAPER = json.loads((HERE / "paper.json").read_text())  # what it compares, its n
 REFERENCES = json.loads((HERE / "references.json").read_text())  # made by scripted.py
 RESAMPLES = 5_000
 LAST = 5  # evaluations at the end of a run whose mean is its final performance, so that no lucky point decides
-SOLVED = 0.98  # of the optimum, in each of these evaluations
+KEPT, NEAR = 3, 0.95  # a run solves a task when so many evaluations in a row have this share of the optimum
+EQUAL = 0.02  # of the range from random to optimum: returns that differ by less are equal
 
 
 def iqm(*samples, axis=-1):
@@ -41,51 +41,93 @@ def iqm(*samples, axis=-1):
     return stats.trim_mean(np.concatenate(samples, axis), 0.25, axis=axis)
 
 
-def improvement(*samples, axis=-1):
-    """P(X > Y) of Agarwal et al. 2021, ties count half, a mean over tasks. samples: x of each task, then y of each."""
-    pairs = zip(samples[: len(samples) // 2], samples[len(samples) // 2 :], strict=True)  # float [..., runs] each
-    return np.mean([(np.sign(x[..., :, None] - y[..., None, :]) / 2 + 0.5).mean((-2, -1)) for x, y in pairs], axis=0)
+def gap(*samples, axis=-1):
+    """Optimality gap of Agarwal et al. 2021: how far scaled returns are below 1 on average; those above count as 1."""
+    return np.mean(np.maximum(0, 1 - np.concatenate(samples, axis)), axis)
+
+
+def difference(x, y, axis=-1):
+    """Of the means of two samples."""
+    return np.mean(x, axis) - np.mean(y, axis)
+
+
+def interval(statistic, samples):
+    """The 95% percentile interval of a statistic, runs being redrawn within each sample; nan for single runs."""
+    if min(map(len, samples)) < 2:
+        return np.nan, np.nan
+    options = dict(n_resamples=RESAMPLES, vectorized=True, axis=-1, method="percentile", rng=0)
+    return stats.bootstrap(samples, statistic, **options).confidence_interval
 
 
 def with_interval(statistic, samples, digits):
-    """A statistic with its 95% percentile interval, runs being redrawn within each sample; of single runs without."""
-    text = f"{statistic(*samples):.{digits}f}"
-    if min(map(len, samples)) < 2:
-        return text
-    options = dict(n_resamples=RESAMPLES, vectorized=True, axis=-1, method="percentile", rng=0)
-    low, high = stats.bootstrap(samples, statistic, **options).confidence_interval
-    return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
+    """A statistic with its interval, as text; of single runs without."""
+    low, high = interval(statistic, samples)
+    text = f"{statistic(*samples):z,.{digits}f}"
+    return text if np.isnan(low) else f"{text} [{low:z,.{digits}f}, {high:z,.{digits}f}]"
+
+
+def holm(p):
+    """p-values of several tests, float64 [tests], corrected: the chance that any is below 0.05 by accident is 5%."""
+    order = np.argsort(p)
+    corrected = np.empty(len(p))
+    corrected[order] = np.maximum.accumulate(np.arange(len(p), 0, -1) * np.sort(p))
+    return np.minimum(corrected, 1.0)
+
+
+def check(run, evaluations):
+    """The numbers of a run that can be shown, a DataFrame; raises ValueError for any other, with the reason."""
+    if not all(isinstance(run[name], str) for name in (*record.KEY, "variant", "commit", "date")):
+        raise ValueError("its description is not of text")
+    numbers = evaluations[["step", *record.VALUES]].apply(pd.to_numeric, errors="coerce").astype(float)
+    if not np.isfinite(numbers).all(axis=None):
+        raise ValueError("an evaluation has a number missing, or something that is no finite number")
+    if f"{numbers['step'].max():.0f}" != run["steps"]:
+        raise ValueError(f"its evaluations do not go up to step {run['steps']}: cut short")
+    return numbers
 
 
 def read_runs(paths):
     """Two DataFrames, runs and evaluations (`run` is the index of the first), and notes on runs that are left out.
 
     The columns of VALUES are a run's final performance; `scaled` is 0 for the random policy and 1 for the scripted.
+    `solved_at` is the step of the last of KEPT evaluations, nan for never; `needed` is the budget then.
     """
-    found, notes = [], []
+    found, kept, notes = [], [], []
     for path in map(Path, paths):
         try:
-            found += record.load_runs(path.resolve(strict=True))
+            kept += record.load_runs(path.resolve(strict=True))
         except (OSError, ValueError) as error:
             sys.exit(f"report: cannot read {path}: {error}")
         for folder in sorted(file.parent for file in path.rglob("args.json")):
             try:
                 if not record.is_finished(folder):
                     raise ValueError("not finished")
-                found.append(record.read_folder(folder))
-            except (OSError, ValueError, KeyError, TypeError, ImportError, SystemExit) as error:
+                run, evaluations = record.read_folder(folder)
+                found.append((run, check(run, evaluations)))
+            except (OSError, ValueError, KeyError, TypeError, SystemExit) as error:
                 notes.append(f"{folder.name}: left out, {error}")
+    for run, evaluations in kept:
+        try:
+            found.append((run, check(run, evaluations)))
+        except ValueError as error:
+            notes.append(f"{run['algorithm']} on {run['env']}, seed {run['seed']}: left out, {error}")
     if not found:
         sys.exit("report: no finished run found")
-    runs = pd.DataFrame([run for run, _ in found]).astype({"seconds": float})
+    runs = pd.DataFrame([run for run, _ in found])
     evaluations = pd.concat([values.assign(run=i) for i, (_, values) in enumerate(found)])
-    evaluations = evaluations[["run", "step", *record.VALUES]].apply(pd.to_numeric)
-    last = evaluations.sort_values("step").groupby("run").tail(LAST).groupby("run")
+    evaluations = evaluations.sort_values(["run", "step"])
+    last = evaluations.groupby("run").tail(LAST).groupby("run")
     runs = runs.join(last[record.VALUES].mean().round(6)).join(last["step"].max())  # rounded: ties stay ties
     for column, kind in (("floor", "random"), ("ceiling", "scripted")):
-        runs[column] = [REFERENCES[env][kind]["return"] for env in runs["env"]]
+        returns = {env: reference[kind]["return"] for env, reference in REFERENCES.items()}
+        runs[column] = runs["env"].map(returns)  # nan for a task of one's own
     runs["scaled"] = (runs["return"] - runs["floor"]) / (runs["ceiling"] - runs["floor"])
-    runs["solved"] = last["return"].min() >= SOLVED * runs["ceiling"]
+    runs["optimal"] = [REFERENCES.get(env, {"scripted": {}})["scripted"].get("optimal", False) for env in runs["env"]]
+    optimum = evaluations["run"].map(runs["ceiling"].where(runs["optimal"]))  # nan where none is known
+    near = (evaluations["return"] >= NEAR * optimum).groupby(evaluations["run"])
+    kept = evaluations[near.transform(lambda of: of.rolling(KEPT).sum()) == KEPT]
+    runs["solved_at"] = kept.groupby("run")["step"].min()
+    runs["needed"] = runs["solved_at"].fillna(runs["step"])
     same = ["env", "algorithm", "variant", "seed"]
     newest = runs.sort_values("date", kind="stable").drop_duplicates(same, keep="last")
     for run in runs.drop(newest.index).itertuples():
@@ -97,27 +139,25 @@ def read_runs(paths):
 def panels_of(section, runs):
     """{title: runs, with a column `label`} of the panels of a section of paper.json.
 
-    A panel is a task, where algorithms are compared, a task and an algorithm, of which variants are compared, or a
-    task and one of the section's groups, {algorithm: variant}, where algorithms are compared, each as that variant.
+    A panel is a task, where algorithms are compared, or a task and an algorithm, of which variants are compared.
     """
     names, panels = PAPER["names"], {}
     variants = section.get("variants") or {variant: f" {variant}".rstrip() for variant in runs["variant"]}
     for panel in itertools.chain.from_iterable(section["panels"]):
         env, _, kind = panel.partition(" ")
         on = runs[runs["env"] == env]
-        if group := section.get("groups", {}).get(kind):
-            of = on[on["algorithm"].map(group) == on["variant"]]
-            labels = of["algorithm"].replace(names)
-        else:
-            algorithms = [kind] if kind else section.get("algorithms", runs["algorithm"])
-            of = on[on["variant"].isin(variants) & on["algorithm"].isin(algorithms)]
-            labels = ("" if kind else of["algorithm"].replace(names)) + of["variant"].map(variants)
+        algorithms = [kind] if kind else section.get("algorithms", runs["algorithm"])
+        of = on[on["variant"].isin(variants) & on["algorithm"].isin(algorithms)]
+        labels = ("" if kind else of["algorithm"].replace(names)) + of["variant"].map(variants)
         panels[f"{env} {names.get(kind, kind)}".strip()] = of.assign(label=labels)
     return panels
 
 
-def plot(path, widths, panels, evaluations, shares):
-    """A PNG of panels, so many in each row, with one legend; those without runs stay empty. shares: as for `draw`."""
+def plot(path, widths, panels, draw_panel, empty):
+    """A PNG of panels, so many in each row, with one legend.
+
+    draw_panel: a function of (axes, runs, {label: style}). empty: what the title of a panel without runs says.
+    """
     plt.rcParams.update(PAPER["matplotlib"])
     figure = plt.figure(figsize=(max(9, 3.5 * max(widths)), 1 + 3.2 * len(widths)))
     titles, others = iter(panels), itertools.cycle(PAPER["other styles"])
@@ -126,40 +166,43 @@ def plot(path, widths, panels, evaluations, shares):
     styles = PAPER["styles"] | {label: next(others) for label in sorted(labels - PAPER["styles"].keys())}
     legend = {}
     for title, ax in figure.subplot_mosaic(mosaic).items():
-        ax.set_title(title if len(panels[title]) else f"{title}: no runs yet")
+        ax.set_title(title if len(panels[title]) else f"{title}: {empty}")
         if not len(panels[title]):
             ax.axis("off")
             continue
-        draw(ax, panels[title], evaluations, styles, shares)
+        draw_panel(ax, panels[title], styles)
         legend |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     columns = max(1, int(11 * figure.get_figwidth()) // (max(map(len, legend)) + 9))  # as many as fit side by side
     figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns)
-    figure.savefig(path)
+    record.replace(path, lambda new: figure.savefig(new, format="png"))
     plt.close(figure)
 
 
-def draw(ax, runs, evaluations, styles, shares=False):
+def draw(ax, runs, styles, evaluations, shares=False):
     """A panel of learning curves: the mean with standard errors at the steps that all runs have.
 
     shares: against the share of the run, for runs of different lengths that take the same time.
     """
     groups = runs.groupby("label", sort=False)
-    floor, ceiling = runs[["floor", "ceiling"]].iloc[0]
+    floor, ceiling = runs[["floor", "ceiling"]].iloc[0]  # nan for a task of one's own
     lowest = floor - (ceiling - floor) / 2  # early curves may go far down; a band is not drawn without its curve
     for i, (label, of) in enumerate(groups):
         curves = evaluations[evaluations["run"].isin(of.index)].pivot(index="run", columns="step", values="return")
         middle, error = curves.dropna(axis=1).mean(), curves.dropna(axis=1).sem()
+        if middle.empty:  # no two of these runs were evaluated at the same steps
+            continue
         x = middle.index / (middle.index[-1] / 100 if shares else 1000)
         every = max(1, len(middle) // 8)
         colour, marker = styles[label]
         marks = dict(marker=marker, ms=4.5, markevery=(i * every // len(groups), every))
-        band = dict(where=middle >= lowest, color=colour, alpha=0.15, lw=0, zorder=2)
+        band = dict(where=~(middle < lowest), color=colour, alpha=0.15, lw=0, zorder=2)
         ax.fill_between(x, middle - error, middle + error, **band)
         ax.plot(x, middle, color=colour, lw=1.7, label=label, zorder=3 + len(groups) - i, **marks)
     for level, line, label in ((floor, ":", "random policy"), (ceiling, "--", "scripted policy")):
-        ax.axhline(level, color="#444444", lw=1.2, ls=line, label=label, zorder=1)
-    bottom = max(ax.get_ylim()[0], lowest)
-    top = max(np.max(line.get_ydata()) for line in ax.lines)
+        if np.isfinite(level):
+            ax.axhline(level, color="#444444", lw=1.2, ls=line, label=label, zorder=1)
+    bottom = np.fmax(ax.get_ylim()[0], lowest)
+    top = max((np.max(line.get_ydata()) for line in ax.lines), default=bottom + 1)
     ax.set_ylim(bottom, top + 0.05 * (top - bottom))
     usual = runs[runs["variant"] == ""]  # a variant may go on for longer
     ax.set_xlim(0, 100 if shares else (usual if len(usual) else runs)["step"].max() / 1000)
@@ -167,60 +210,103 @@ def draw(ax, runs, evaluations, styles, shares=False):
     ax.set(xlabel=x, ylabel="return of greedy episodes")
 
 
+def draw_solved(ax, runs, styles):
+    """A panel of the share of runs that have solved the task; below, the IQM of the steps needed, with its interval."""
+    end = runs["step"].max() / 1000
+    for i, (label, of) in enumerate(runs.groupby("label", sort=False), 1):
+        colour, marker = styles[label]
+        solved_at = np.sort(of["solved_at"].dropna()) / 1000
+        share = np.arange(len(solved_at) + 1) / len(of)
+        ax.step([0, *solved_at, end], [*share, share[-1]], where="post", color=colour, lw=1.7)
+        needed = [of["needed"].to_numpy() / 1000]
+        ax.plot(interval(iqm, needed), [-0.07 * i] * 2, color=colour, lw=1.7)
+        ax.plot(iqm(*needed), -0.07 * i, color=colour, marker=marker, ms=4.5, ls="", label=label)
+    ax.set(xlim=(0, end), ylim=(-0.07 * (i + 1), 1.05), yticks=[0, 0.5, 1])
+    ax.set(xlabel="environment steps (thousands)", ylabel="share of runs that solve it")
+
+
 def table(rows):
     """A Markdown table of rows, {column: cell} each; cells that a row does not have are empty, as are whole columns."""
-    frame = pd.DataFrame(rows, dtype=object).replace("", None).dropna(axis=1, how="all").fillna("")
-    lines = [frame.columns, ["---"] * frame.shape[1], *frame.to_numpy()]
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = [name for name in names if any(row.get(name) not in (None, "") for row in rows)]
+    cells = [["" if row.get(name) is None else row[name] for name in columns] for row in rows]
+    lines = [columns, ["---"] * len(columns), *cells]
     return "".join("| " + " | ".join(map(str, line)) + " |\n" for line in lines) + "\n"
 
 
-def samples(panels, column):
-    """{label: [the runs' values in each panel]} of the labels that have runs in all panels."""
-    runs = pd.concat(panels, names=["panel"])
-    values = runs.groupby(["label", "panel"], sort=False)[column].agg(np.array).unstack().dropna()
-    return {label: list(values.loc[label]) for label in runs["label"].unique() if label in values.index}
+def compare(a, b, digits):
+    """What a table says of the runs of two labels on a task, {column: cell}, and the p-value of their difference.
+
+    If half of the runs of each solve it, the steps needed decide, otherwise the returns at the end.
+    """
+    solve = min(a["solved_at"].notna().mean(), b["solved_at"].notna().mean()) >= 0.5
+    returns, needed = ([of[column].to_numpy() for of in (a, b)] for column in ("return", "needed"))
+    row = {"return: A - B [95%]": with_interval(difference, returns, digits)}
+    row["steps: A - B [95%]"] = with_interval(difference, needed, 0) if solve else ""
+    x, y = (-needed[0], -needed[1]) if solve else returns
+    test = stats.mannwhitneyu(x, y)
+    share = test.statistic / (len(x) * len(y))
+    row["P(A better)"] = f"{share:.2f}"
+    low, high = interval(difference, returns)
+    margin = EQUAL * (a["ceiling"] - a["floor"]).iloc[0]
+    equal = -margin < low and high < margin
+    row["verdict"] = "equal returns" if equal else "cannot be told"
+    if solve or not equal:
+        row["if certain"] = f"{'A' if share > 0.5 else 'B'} {'sooner' if solve else 'higher'}"
+    return row, test.pvalue
 
 
 def tables(panels, paper):
-    """What the runs of each label end with and the paper's number, and P(A > B), in each panel and over all of them."""
-    rows, pairs = [], {}
+    """Two tables: what the runs of each label end with and the paper's number, and what pairs of labels differ by."""
+    rows, pairs, p, scaled = [], [], [], {}
     for panel, runs in panels.items():
         env = runs["env"].iloc[0]
-        digits, optimal = 3 if env.startswith("ct") else 1, REFERENCES[env]["scripted"]["optimal"]
-        for label, of in runs.groupby("label", sort=False):
-            k, n = of["solved"].sum(), len(of)
+        digits = 1 if env.startswith(("bp", "wtd")) else 3
+        groups = dict(list(runs.groupby("label", sort=False)))
+        for label, of in groups.items():
+            k, n = of["solved_at"].count(), len(of)
             low, high = stats.binomtest(k, n).proportion_ci(method="exact")
             row = {"task": panel, "": label, "paper": paper.get(env, {}).get(label), "runs": n}
             for column, x in (("return: mean ± SE", of["return"]), ("discounted", of["discounted_return"])):
                 row[column] = f"{x.mean():.{digits}f} ± {x.sem():.{digits}f}".removesuffix(" ± nan")
             row["IQM [95%]"] = with_interval(iqm, [of["return"].to_numpy()], digits)
-            row["solved [95%]"] = f"{k} of {n} [{low:.2f}, {high:.2f}]" if optimal else "no optimum known"
-            row |= {kind: f"{of[kind].iloc[0]:.{digits}f}" for kind in ("floor", "ceiling")}
-            rows.append(row | {"steps": f"{of['step'].max():,}", "time": f"{of['seconds'].mean() / 60:.1f} min"})
-    columns = {panel: {panel: runs} for panel, runs in panels.items()}
-    if len(panels) > 1:
-        columns["all"] = panels
-        for label, scaled in samples(panels, "scaled").items():
-            rows.append({"task": "all, scaled", "": label, "IQM [95%]": with_interval(iqm, scaled, 3)})
-    for column, of in columns.items():
-        returns = samples(of, "return")
-        for a, b in itertools.combinations(returns, 2):
-            pair = pairs.setdefault((a, b), {"P(A > B)": f"{a} > {b}"})
-            pair[column] = with_interval(improvement, returns[a] + returns[b], 2)
-    return table(rows) + (table(pairs.values()) if pairs else "")
+            if of["optimal"].all():
+                row["solved [95%]"] = f"{k} of {n} [{low:.2f}, {high:.2f}]"
+                row["steps needed: IQM [95%]"] = with_interval(iqm, [of["needed"].to_numpy()], 0)
+            if env in REFERENCES:
+                row |= {kind: f"{of[kind].iloc[0]:.{digits}f}" for kind in ("floor", "ceiling")}
+                scaled.setdefault(label, []).append(of["scaled"].to_numpy())
+            rows.append(row | {"steps": f"{of['step'].max():,.0f}"})
+        usual, *others = groups
+        of_panel = itertools.product([usual], others) if " " in panel else itertools.combinations(groups, 2)
+        for a, b in of_panel:
+            cells, value = compare(groups[a], groups[b], digits)
+            pairs.append({"A": a, "B": b, "task": panel, **cells})
+            p.append(value)
+    for label, values in scaled.items():
+        if 1 < len(values) == len(panels):
+            row = {"task": "all, scaled", "": label, "IQM [95%]": with_interval(iqm, values, 3)}
+            rows.append(row | {"optimality gap [95%]": with_interval(gap, values, 3)})
+    for pair, value in zip(pairs, holm(p), strict=True):
+        certain = pair.pop("if certain", None)
+        pair["p (Holm)"] = f"{value:.3f}"
+        pair["verdict"] = certain if certain and value < 0.05 else pair["verdict"]
+    return table(rows) + (table(pairs) if pairs else "")
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="*", default=[record.RESULTS], metavar="RUNS", help="default: benchmark/results")
-    parser.add_argument("-o", "--output", type=Path, default=record.RESULTS, help="folder (default: benchmark/results)")
+    parser.error = lambda message: sys.exit(f"report: {message}")
+    add, results = parser.add_argument, record.RESULTS
+    add("runs", nargs="*", default=[results], metavar="RUNS", help="default: benchmark/results")
+    add("-o", "--output", type=record.folder, default=results, help="folder (default: benchmark/results)")
     args = parser.parse_args(argv)
-    runs, evaluations, notes = read_runs(args.runs)
-    for note in notes:
-        print(f"report: {note}", file=sys.stderr)
-    shown, missing, text = set(), [], ""
     try:
-        args.output.mkdir(parents=True, exist_ok=True)
+        record.make_folder(args.output)
+        runs, evaluations, notes = read_runs(args.runs)
+        for note in notes:
+            record.tell(f"report: {note}")
+        shown, missing, text = set(), [], ""
         for title, section in PAPER["sections"].items():
             rest = list(runs.drop(shown)["env"].unique())  # tasks of runs that no section before has shown
             rows = section["panels"] or [rest[i : i + 4] for i in range(0, len(rest), 4)]
@@ -228,22 +314,28 @@ def main(argv=None):
             panels = panels_of(section | {"panels": rows}, runs)
             new = set().union(*(of.index for of in panels.values())) - shown
             if not new:  # nothing that was not to be seen in a section before
-                missing += [title] if section["panels"] and not section.get("older") else []
+                missing += [title] if section["panels"] else []
                 continue
             shown |= new
             name = title.lower().replace(" ", "-")
             widths, shares = [len(row) for row in rows], section.get("shares", False)
-            plot(args.output / f"{name}.png", widths, panels, evaluations, shares)
+            curves = partial(draw, evaluations=evaluations, shares=shares)
+            plot(args.output / f"{name}.png", widths, panels, curves, "no runs yet")
             text += f"## {title}\n\n{section['about']}\n\n![{title}]({name}.png)\n\n"
+            known = {panel: of[of["optimal"]] for panel, of in panels.items()}
+            if any(map(len, known.values())):
+                plot(args.output / f"{name}-solved.png", widths, known, draw_solved, "no runs, or no optimum known")
+                text += f"![{title}: solved]({name}-solved.png)\n\n"
             text += tables({panel: of for panel, of in panels.items() if len(of)}, section.get("paper", {}))
         sources = runs.groupby(["algorithm", "variant", "flags", "checksum"], sort=False)
         sources = sources[["env", "seed", "commit"]].agg(lambda x: " ".join(x.unique())).reset_index()
-        values = dict(sections=text, missing="; ".join(missing) or "none", sources=table(sources.to_dict("records")))
-        values |= dict(notes="".join(f"- {note}\n" for note in notes), last=LAST, solved=SOLVED, resamples=RESAMPLES)
+        record.replace_text(args.output / "sources.csv", sources.to_csv(index=False, lineterminator="\n"))
+        values = dict(sections=text, missing="; ".join(missing) or "none", resamples=RESAMPLES)
+        values |= dict(last=LAST, kept=KEPT, near=NEAR, equal=EQUAL, notes="".join(f"- {note}\n" for note in notes))
         text = (HERE / "report.md").read_text().format(**values).strip()
-        (args.output / "README.md").write_text(f"{text}\n")
+        record.replace_text(args.output / "README.md", f"{text}\n")
     except OSError as error:
-        sys.exit(f"report: cannot write to {args.output}: {error.strerror}")
+        sys.exit(f"report: cannot write to {args.output}: {error.strerror or error}")
     print(args.output / "README.md")
 
 

@@ -19,6 +19,7 @@ agents that are not free do not matter.
 
 import argparse
 import json
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -148,8 +149,10 @@ def main(argv=None):
     parser.add_argument("--episodes", type=int, default=2000, help="of each policy on each task (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, help="JSON file to write, with the tasks that were played")
     args = parser.parse_args(argv)
-    if args.episodes < 2:
-        sys.exit("scripted: --episodes must be at least 2")
+    if not 2 <= args.episodes <= 100_000:
+        sys.exit("scripted: --episodes must be from 2 to 100,000")
+    if args.output and (args.output.is_dir() or not os.access(args.output.parent, os.W_OK)):
+        sys.exit(f"scripted: cannot write {args.output}: it has to be a file in a folder that can be written")
     references = {}
     print(f"{'task':16} {'policy':26} return, its standard error, discounted return, length, success")
     for env_id in args.envs:
@@ -160,9 +163,12 @@ def main(argv=None):
             numbers = " ".join(f"{x[key]:10.3f}" for key in ("return", "se", "discounted_return", "length", "success"))
             print(f"{env_id:16} {x.get('name', kind):26} {numbers}", flush=True)
     if args.output:
+        new = Path(f"{args.output}.new")
         try:
-            args.output.write_text(json.dumps(references, indent=1) + "\n")
+            new.write_text(json.dumps(references, indent=1) + "\n")
+            new.replace(args.output)
         except OSError as error:
+            new.unlink(missing_ok=True)
             sys.exit(f"scripted: cannot write {args.output}: {error.strerror}")
 
 

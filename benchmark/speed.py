@@ -94,8 +94,11 @@ def run(checkout, name, flags):
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def training(checkouts, name, args, steps, rounds):
-    """Seconds of an update and of a step of training, by measure: float64 [rounds, checkouts]. args: the script's."""
+def plan(name, args, steps):
+    """The flags of three runs, of one step, without updates and with, their steps, updates, and updates a step.
+
+    args: the script's. steps: how many the latter two take once every environment has ended an episode.
+    """
     first = envs.make(args.env).horizon * args.num_envs  # steps after which an episode has ended everywhere
     total = first + -(-steps // args.num_envs) * args.num_envs
     common = {"env": args.env, "num-envs": args.num_envs, "total-timesteps": total, "eval-episodes": 1}
@@ -112,6 +115,12 @@ def training(checkouts, name, args, steps, rounds):
     if not updates:
         sys.exit(f"speed: {name} makes no update in {steps} steps on {args.env}: give it more --steps")
     runs = common | {"total-timesteps": 1}, common | idle, common | learning
+    return runs, total, updates, updates_per_step
+
+
+def training(checkouts, name, args, steps, rounds):
+    """Seconds of an update and of a step of training, by measure: float64 [rounds, checkouts]. args: the script's."""
+    runs, total, updates, updates_per_step = plan(name, args, steps)
     seconds = [[[run(checkout, name, flags) for checkout in checkouts] for flags in runs] for _ in range(rounds)]
     begin, without, whole = np.moveaxis(seconds, 1, 0)
     update = (whole - without) / updates
@@ -176,36 +185,42 @@ def print_scaling(updates):
             print("| " + " | ".join(cells) + " |", flush=True)
 
 
+def count(text):
+    """The number that a word is, from 1 to a million."""
+    number = int(text)
+    if not 1 <= number <= 1_000_000:
+        raise ValueError
+    return number
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: sys.exit(f"speed: {message}")
     add, tasks = parser.add_argument, ["wtd-s", "bp-10", "ct-10"]
     add("--scripts", nargs="+", default=record.scripts(), choices=record.scripts(), metavar="NAME", help="default: all")
     add("--envs", nargs="+", default=tasks, choices=envs.IDS, metavar="ID", help=f"default: {' '.join(tasks)}")
-    add("--num-envs", type=int, help="environments side by side (default: the script's)")
-    add("--steps", type=int, default=10_000, help="of a training run after its first episodes (default: %(default)s)")
-    add("--rounds", type=int, default=3, help="default: %(default)s")
-    add("--against", metavar="FOLDER", type=Path, help="another checkout to compare with")
+    add("--num-envs", type=count, help="environments side by side (default: the script's)")
+    add("--steps", type=count, default=10_000, help="of a training run after its first episodes (default: %(default)s)")
+    add("--rounds", type=count, default=3, help="default: %(default)s")
+    add("--against", metavar="FOLDER", type=record.folder, help="another checkout to compare with")
     add("--scaling", action="store_true", help="tables of cost and memory by size instead; goes with --rounds alone")
     args = parser.parse_args(argv)
     if args.scaling:
         if any(v != parser.get_default(k) for k, v in vars(args).items() if k not in ("scaling", "rounds")):
             sys.exit("speed: --scaling measures sizes of its own: only --rounds goes with it")
-        if args.rounds < 1:
-            sys.exit("speed: --rounds must be at least 1")
         return print_scaling(5 * args.rounds)
-    if min(args.steps, args.rounds, 1 if args.num_envs is None else args.num_envs) < 1:
-        sys.exit("speed: --num-envs, --steps and --rounds must be at least 1")
-    if args.against and not args.against.is_dir():
-        sys.exit(f"speed: --against {args.against} is no folder")
+    checkouts, cells = [record.ROOT, *([args.against] if args.against else [])], []
+    for name, env_id in itertools.product(args.scripts, args.envs):
+        if not (checkouts[-1] / f"{name}.py").is_file():
+            sys.exit(f"speed: there is no {checkouts[-1] / name}.py")
+        usual = record.load_script(name).parse_args([f"--env={env_id}"])
+        usual.num_envs = args.num_envs or usual.num_envs
+        plan(name, usual, args.steps)  # what cannot be measured is told before the first measure
+        cells.append((record.load_script(name), usual))
     torch.set_num_threads(1)
     print(f"{'measure':34} {'ms each':>9}", f"{'there':>9}  median ratio (of all rounds)" if args.against else "")
-    for name, env_id in itertools.product(args.scripts, args.envs):
-        script = record.load_script(name)
-        usual = script.parse_args([f"--env={env_id}"])
-        usual.num_envs = args.num_envs or usual.num_envs
-        checkouts = [record.ROOT, args.against] if args.against else [record.ROOT]
-        measures = {}
+    for script, usual in cells:
+        name, env_id, measures = script.__name__, usual.env, {}
         if not args.against:
             env = envs.make(env_id, usual.num_envs)
             agents = script.make_learner(usual, env)["agents"]

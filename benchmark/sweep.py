@@ -4,14 +4,15 @@
     python benchmark/sweep.py --algos avf_qmix --envs wtd-s --seeds 1-3 --record -- --mixer-state single
 
 What follows -- goes to every script. Finished runs are skipped, others go on from their checkpoint, a crashed one is
-tried once more. Ctrl-C, SIGTERM and, on Linux, even the death of this program end the scripts, too. The same command
-then goes on from their checkpoints, so each run loses a minute at most. A run is the same if algorithm, task, flags,
-seed and code are. With --record finished runs are added to runs.csv and evaluations.csv, and what is in there is
-skipped. With --engine ray each run is a Ray task of one CPU, whose nodes must have this repository and the runs folder
-under the same paths.
+tried once more. Ctrl-C, SIGTERM, a closed terminal and, on Linux, even the death of this program end the scripts, too.
+The same command then goes on from their checkpoints, so each run loses a minute at most. A run is the same if
+algorithm, task, flags, seed and code are. With --record finished runs are added to runs.csv and evaluations.csv, and
+what is in there is skipped. With --engine ray each run is a Ray task of one CPU, whose nodes must have this repository
+and the runs folder under the same paths.
 """
 
 import argparse
+import contextlib
 import fcntl
 import itertools
 import json
@@ -40,6 +41,8 @@ LOST_WORKERS = 10  # times that a run is moved to another Ray worker
 LOG = "log.txt"
 LOCK_SECONDS = 120  # to wait for another process to leave a run; NFS needs 90 to give up the locks of a lost machine
 
+SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP  # the last one is of a terminal that is closed
+
 # The signals that this program received, or in a Ray worker the cancellations of its task: the first one ends scripts.
 stop = []
 
@@ -60,8 +63,9 @@ def find_run(job):
     """The folder of a job's run and whether the run is finished; (None, False) if there is nothing to go on with."""
     found = None, False
     for folder in sorted(path.parent for path in Path(job["place"]).glob("*/args.json")):
-        if record.is_finished(folder):
-            return folder, True
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # of an args.json that a kill has cut short
+            if record.is_finished(folder):
+                return folder, True
         if (folder / "checkpoint.pt").exists():
             found = folder, False
     return found
@@ -106,7 +110,7 @@ def run_job(job):
                 result = "failed"
             else:
                 if attempts:
-                    print(f"{job['name']}: {error}; tried once more", file=sys.stderr)
+                    record.tell(f"{job['name']}: {error}; tried once more")
                 attempts += 1
                 code = run_script(job, folder, log)
                 error = f"exit code {code}: {path.read_text(errors='replace').splitlines()[-1]}"
@@ -168,11 +172,12 @@ def start_ray(args):
 def run_jobs(jobs, args):
     """Runs jobs side by side, shows how far they are, records finished runs; puts into the jobs how they ended."""
     run = start_ray(args) if args.engine == "ray" else run_job
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: stop.append(number))
+    for number in SIGNALS:
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # under nohup it is ignored
+            signal.signal(number, lambda number, frame: stop.append(number))
     with (
         ThreadPoolExecutor(args.workers or len(jobs) + 1) as pool,
-        tqdm(total=len(jobs), unit="run", smoothing=0, disable=not sys.stderr.isatty()) as bar,
+        tqdm(total=len(jobs), unit="run", smoothing=0, disable=not (sys.stderr and sys.stderr.isatty())) as bar,
     ):
         pending = {pool.submit(run, job): job for job in jobs}
         for done, future in enumerate(as_completed(pending), 1):
@@ -187,17 +192,25 @@ def run_jobs(jobs, args):
             except Exception as error:  # the engine's own: an unwritable log, or workers lost once too often
                 job |= {"result": "stopped" if stop else "failed", "error": repr(error).strip().splitlines()[-1]}
             bar.update()
-            ended = f"[{done}/{len(jobs)}] {job['name']}: {job['result']}, {job['time']}, return {job['return']}"
-            tqdm.write(ended, sys.stderr)
+            ended = f"{job['name']}: {job['result']}, {job['time']}, return {job['return']}"
+            record.tell(f"[{done}/{len(jobs)}] {ended}")
+
+
+def task(text):
+    """The id of a task, or "module:id", whose module is imported."""
+    problem = envs.problem(text)
+    if problem:
+        raise argparse.ArgumentTypeError(problem)
+    return text
 
 
 def seeds(text):
     """Those of a word such as 3 or 1-5."""
     first, _, last = text.partition("-")
-    found = range(int(first), int(last or first) + 1)
-    if not found:
+    first, last = int(first), int(last or first)
+    if not first <= last < first + 10_000 or last > 10**15:
         raise ValueError
-    return found
+    return range(first, last + 1)
 
 
 def make_jobs(args, options):
@@ -214,12 +227,14 @@ def make_jobs(args, options):
             raise
         if not usual.items() <= arguments.items():
             sys.exit("sweep: --env, --seed and --runs-dir cannot stand behind --, the sweep sets them")
-        cells.append((algorithm, env, record.flags_of(algorithm, arguments), record.checksum(algorithm, env)))
+        flags = record.flags_of(record.values_of(algorithm, env), arguments)
+        cells.append((algorithm, env, flags, record.checksum(algorithm, env)))
     # All of the first seed before the second, so that a sweep of days soon shows something of everything
     for seed, cell in itertools.product(dict.fromkeys(itertools.chain.from_iterable(args.seeds)), cells):
         algorithm, env, flags, code = cell
         key = algorithm, env, flags, str(seed), code
-        place = args.runs_dir.resolve() / f"{env}__{algorithm}__{seed}__{zlib.crc32(repr(key).encode()):08x}"
+        name = f"{env}__{algorithm}__{seed}__{zlib.crc32(repr(key).encode()):08x}".replace(":", "-")
+        place = args.runs_dir.resolve() / name
         job = dict(zip(record.KEY, key, strict=True)) | dict(key=key, name=f"{algorithm} {env} seed {seed}")
         job |= dict(variant=flags if args.variant is None else args.variant, options=options, place=str(place))
         jobs.append(job | NOT_RUN)
@@ -234,11 +249,11 @@ def main(argv=None):
     parser.error = lambda message: sys.exit(f"sweep: {message}")
     add, names = parser.add_argument, dict(nargs="+", required=True, metavar="NAME")
     add("--algos", choices=record.scripts(), help="names of scripts, without .py", **names)
-    add("--envs", choices=envs.IDS, help="ids of tasks", **names)
+    add("--envs", type=task, help="ids of tasks, or module:id", **names)
     add("--seeds", type=seeds, nargs="+", required=True, help="such as 1-5 or 1 3 7-9")
     add("--workers", type=int, help="runs side by side (default: CPU cores of this machine)")
-    add("--runs-dir", type=Path, default=Path("runs"), help="folder of the run folders (default: runs)")
-    add("--record", type=Path, nargs="?", const=record.RESULTS, metavar="FOLDER", help="keep results in a folder")
+    add("--runs-dir", type=record.folder, default=Path("runs"), help="folder of the run folders (default: runs)")
+    add("--record", type=record.folder, nargs="?", const=record.RESULTS, metavar="FOLDER", help="keep results there")
     add("--variant", help="what reports call runs with these flags (default: the flags)")
     add("--engine", choices=("local", "ray"), default="local", help="default: local")
     add("--address", help="with --engine ray: of a cluster, or auto (default: starts one here)")
@@ -252,7 +267,7 @@ def main(argv=None):
     jobs, recorded = make_jobs(args, argv[cut + 1 :]), set()
     try:
         for folder in [] if args.dry_run else filter(None, (args.runs_dir, args.record)):
-            folder.mkdir(parents=True, exist_ok=True)
+            record.make_folder(folder)
         if args.record:
             recorded = set(record.load(args.record)[0][record.KEY].itertuples(index=False, name=None))
     except (OSError, ValueError) as error:
@@ -272,7 +287,7 @@ def main(argv=None):
             print(f"{job['name']} {job['result']}: {job['error']} (log: {Path(job['place']) / LOG})")
     if stop:
         command = shlex.join([sys.argv[0], *argv])
-        print(f"sweep: stopped; go on from the last checkpoints with: python {command}", file=sys.stderr)
+        record.tell(f"sweep: stopped; go on from the last checkpoints with: python {command}")
         return 128 + stop[0]
     return 0 if all(job["result"] in ("recorded", "skipped", "finished") for job in jobs) else 1
 

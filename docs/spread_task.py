@@ -74,4 +74,12 @@ envs.register(
     options=[go(0), go(1), Option("Stay", stay)],
     horizon=25,
     success=is_covered,
+    defaults=dict(
+        total_timesteps=80_000,
+        learning_starts=2_000,
+        exploration_timesteps=30_000,
+        num_envs=16,
+        train_frequency=32,
+        polyak=0.99,
+    ),
 )

@@ -5,42 +5,96 @@
 """
 
 import difflib
+import functools
 import importlib
+import operator
+import os
+import re
+import sys
 
 import gymnasium as gym
 
 from envs.box_pushing import BoxPushing
 from envs.capture_target import CaptureTarget
-from envs.core import MacroVectorEnv, SingleMacroEnv
+from envs.core import MacroVectorEnv, SingleMacroEnv, TaskError  # noqa: F401, the scripts need TaskError
 from envs.warehouse import Warehouse
 
-_TASKS = {}  # id: (domain, its keywords)
+_TASKS = {}  # id: (domain, its keywords, default settings of the scripts)
 
 
-def register(env_id, domain, **kwargs):
+def register(env_id, domain, defaults=None, **kwargs):
     """Makes a task known to `make`, to `--env` of the scripts and, as `env_id` + "-v0", to Gymnasium.
 
-    `make("module:id")` imports the module first, so a task may be registered in a file of its own.
+    `make("module:id")` imports the module first, so a task may be registered in a file of its own. The definition of a
+    domain may be registered again, with the same keywords or others: Gymnasium warns, and the new one replaces the old
+    one. So a module can be reloaded, and a file that registers a task can run as a script that uses it.
+
+    Gymnasium's spec names the domain's module and class, so that another process can make the task. A class of the main
+    module, or one that is defined in a function, has no such name: then `EnvSpec.to_json` raises an error.
 
     Args:
-        env_id: letters, digits, and "-", "_", "." between them.
+        env_id: letters, digits and "_", with "-" and "." between them.
         domain: a `MacroVectorEnv`, called as `domain(num_envs=..., **kwargs)`.
+        defaults: settings of the scripts for this task, such as {"gamma": 0.98}. Flags on the command line win. A
+            setting that a script does not have is ignored by it.
 
     Raises:
-        ValueError: there is a task of this id.
-        gymnasium.error.Error: the id has other characters.
+        ValueError: the id has other characters, or it is one of `IDS` or that of a task of another domain.
     """
+    if not isinstance(env_id, str) or not re.fullmatch(r"\w+([.-]+\w+)*", env_id):
+        raise ValueError(f"an id must be of letters, digits and '_', with '-' and '.' between them, got {env_id!r}")
     if env_id in _TASKS:
-        raise ValueError(f"there is an environment {env_id!r} already")
-    gym.register(f"{env_id}-v0", "envs:make_single", vector_entry_point="envs:make", kwargs={"env_id": env_id})
-    _TASKS[env_id] = domain, kwargs
+        known, _, _ = _TASKS[env_id]
+        if env_id in IDS or _definition(known) != _definition(domain):
+            raise ValueError(f"there is an environment {env_id!r} already, of {_path(known)}")
+    single = "envs:make_single"
+    batch = "envs:make_batch"
+    spec_kwargs = {"env_id": env_id, "domain": _path(domain), **kwargs}
+    if not _is_importable(domain):
+        single = functools.partial(make_single, domain=domain)
+        batch = functools.partial(make_batch, domain=domain)
+        del spec_kwargs["domain"]
+    gym.register(f"{env_id}-v0", single, vector_entry_point=batch, kwargs=spec_kwargs)
+    _TASKS[env_id] = domain, kwargs, defaults or {}
+
+
+def _path(domain):
+    """The module and the name of a domain, "module:Class"."""
+    return f"{domain.__module__}:{domain.__qualname__}"
+
+
+def _definition(domain):
+    """Where a domain is defined: file and name. A file that runs as a script is the module `__main__`, too."""
+    module = sys.modules.get(domain.__module__)
+    return getattr(module, "__file__", domain.__module__), domain.__qualname__
+
+
+def _is_importable(domain):
+    """Whether other processes can import the domain."""
+    return domain.__module__ != "__main__" and "<locals>" not in domain.__qualname__
+
+
+def _import(module):
+    """Imports a module, from the current folder, too. Raises ImportError, one line, whatever goes wrong in it."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    try:
+        return importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
+        message = " ".join(f"{kind}{error}".split())
+        raise ImportError(f"{message} (in the import of {module!r})") from error
 
 
 def _find(env_id):
-    """The domain of a task and its keywords; raises as `make`."""
-    module, _, name = str(env_id).rpartition(":")
-    if module:
-        importlib.import_module(module)
+    """The domain of a task, its keywords and its default settings; raises as `make`."""
+    module, colon, name = str(env_id).rpartition(":")
+    if colon:
+        if not module or module.startswith("."):
+            raise ValueError(f"{env_id!r} must begin with the full name of a module")
+        if name in IDS:
+            raise ValueError(f"{name!r} is a task of the benchmark: give it without {module + colon!r}")
+        _import(module)
     if name not in _TASKS:
         close = difflib.get_close_matches(name, _TASKS, n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
@@ -49,11 +103,31 @@ def _find(env_id):
 
 
 def problem(env_id):
-    """Why `make` would not know an id, one line, or None if it does."""
+    """Why a script cannot use a task, one line, or None if it can. Makes the task once and takes a step."""
     try:
-        _find(env_id)
+        domain, kwargs, _ = _find(env_id)
     except (ValueError, ImportError) as error:
         return str(error)
+    try:
+        env = domain(num_envs=1, **kwargs)
+        env.reset()
+        env.step(env.available.argmax(axis=2))
+        env.close()
+    except Exception as error:
+        message = " ".join(str(error).split())
+        return f"{env_id}: {type(error).__name__}: {message}"
+
+
+def defaults(env_id, args_class):
+    """Settings that a task was registered with, {name: value}, without those that a script's `Args` does not have.
+
+    They are none for an id that `make` does not know.
+    """
+    try:
+        _, _, settings = _find(env_id)
+    except (ValueError, ImportError):
+        return {}
+    return {name: value for name, value in settings.items() if hasattr(args_class, name)}
 
 
 def make(env_id, num_envs=1, **kwargs) -> MacroVectorEnv:
@@ -66,15 +140,40 @@ def make(env_id, num_envs=1, **kwargs) -> MacroVectorEnv:
 
     Raises:
         ValueError: the id is unknown or an argument is out of range.
-        ImportError: there is no such module.
+        TypeError: the domain has no such keyword.
+        ImportError: the module cannot be imported.
     """
-    domain, task = _find(env_id)
+    domain, task, _ = _find(env_id)
     return domain(num_envs=num_envs, **{**task, **kwargs})
 
 
-def make_single(env_id, **kwargs) -> SingleMacroEnv:
-    """Makes one environment as a `gymnasium.Env`; arguments and errors as `make`."""
-    return SingleMacroEnv(make(env_id, **kwargs))
+def make_batch(num_envs, env_id, domain, max_episode_steps=None, **kwargs) -> MacroVectorEnv:
+    """Makes a batch for `gymnasium.make_vec`.
+
+    Args:
+        domain: a `MacroVectorEnv` or its "module:Class".
+        max_episode_steps: None or the horizon. Gymnasium passes it on from a spec.
+
+    Raises:
+        ValueError, TypeError, ImportError: as `make`, and if `max_episode_steps` is not the horizon.
+    """
+    if isinstance(domain, str):
+        module, _, name = domain.partition(":")
+        domain = operator.attrgetter(name)(_import(module))
+    env = domain(num_envs=num_envs, **kwargs)
+    if max_episode_steps not in (None, env.horizon):
+        raise ValueError(f"{env_id} ends after its horizon, {env.horizon} steps, not after {max_episode_steps}")
+    return env
+
+
+def make_single(env_id, domain, **kwargs) -> SingleMacroEnv:
+    """Makes one environment for `gymnasium.make`; arguments and errors as `make_batch`."""
+    if "num_envs" in kwargs:
+        raise ValueError(f"gymnasium.make makes one {env_id}: for a batch use gymnasium.make_vec(..., num_envs=...)")
+    return SingleMacroEnv(make_batch(1, env_id, domain, **kwargs))
+
+
+make_single.metadata = SingleMacroEnv.metadata  # Gymnasium makes "human" and "rgb_array_list" of these render modes
 
 
 def to_pettingzoo(env_id, **kwargs):

@@ -36,6 +36,12 @@ TURN_COST = np.array([0.0, 0.1, 0.2, 0.1])
 SMALL, BIG = slice(0, 2), 2  # boxes 0 and 1 are small, box 2 is big
 
 
+def is_same_cell(first, second):
+    """Whether two cells [..., (x, y)] are the same, bool [...]."""
+    is_equal = first == second
+    return is_equal[..., 0] & is_equal[..., 1]  # faster than .all(axis=-1)
+
+
 class BoxPushing(MacroVectorEnv):
     """Two agents push boxes to the northernmost row of a grid x grid world (`bp-10`, `bp-20`, `bp-30`).
 
@@ -220,14 +226,13 @@ class BoxPushing(MacroVectorEnv):
             action = PRIMITIVE_TO_MACRO[self.macro_action]
         self._lock_onto_big_box(action)
 
+        # Agent 0 acts before agent 1. What it pushes matters to agent 1, whether agent 1 pushes or goes.
         ended = np.zeros((self.num_envs, 2), bool)
         penalised = np.zeros((self.num_envs, 2), bool)
-        for agent in range(2):
-            go_to_ended = self._go_to(agent, action[:, agent])
-            push_ended, push_penalised = self._push(agent, action[:, agent])
-            turns_or_stays = self._turn_or_stay(agent, action[:, agent])
-            ended[:, agent] = go_to_ended | push_ended | turns_or_stays
-            penalised[:, agent] = push_penalised
+        ended[:, 0], penalised[:, 0] = self._push(0, action[:, 0])
+        go_to_ended = self._go_to(action)
+        ended[:, 1], penalised[:, 1] = self._push(1, action[:, 1])
+        ended |= go_to_ended | self._turn_or_stay(action)
 
         self._push_big_box()
         # Not ==, because a small box can move two cells in a step, and so beyond the goal row. It does if agent 1 is in
@@ -241,8 +246,8 @@ class BoxPushing(MacroVectorEnv):
             ended[:] = True
             self.pushing_big[:] = False
 
-        rewards = self.penalty * np.count_nonzero(penalised, axis=1)
-        rewards += self.small_reward * np.count_nonzero(small_on_goal_row, axis=1)
+        rewards = self.penalty * penalised.sum(axis=1)
+        rewards += self.small_reward * small_on_goal_row.sum(axis=1)
         rewards += np.where(big_on_goal_row, self.big_reward, 0.0)
         rewards += self.step_cost
         terminations = on_goal_row.any(axis=1)
@@ -265,42 +270,43 @@ class BoxPushing(MacroVectorEnv):
         one_at_each_half = at_left_half.any(axis=1) & at_right_half.any(axis=1)
         self.pushing_big |= both_start_push & both_face_north & one_at_each_half
 
-    def _go_to(self, agent, action):
-        """One step of Go-to in the environments where the agent runs it; returns where it ends, bool [N]."""
-        position = self.position[:, agent]  # these two are views: writing to them moves the agent
-        orientation = self.orientation[:, agent]
+    def _go_to(self, action):
+        """One step of Go-to for the agents that run it; returns where it ends, bool [N, agents]."""
         goes = action < PUSH  # macro-actions 0 to 3
-        waypoint = self.waypoints[np.where(goes, action, 0)]  # [N, (x, y)]; unused where nobody goes
-        cheapest = self._cheapest_direction(position, orientation, waypoint)
+        waypoint = self.waypoints[np.where(goes, action, 0)]  # [N, agents, (x, y)]; not used by those who do not go
+        cheapest = self._cheapest_direction(waypoint)
 
-        is_there = goes & (position == waypoint).all(axis=1)
+        is_there = goes & is_same_cell(self.position, waypoint)
         walks = goes & ~is_there
-        is_ahead = cheapest == orientation
-        is_behind = cheapest == (orientation + 2) % 4
+        is_ahead = cheapest == self.orientation
+        is_behind = cheapest == (self.orientation + 2) % 4
         moves = walks & is_ahead
         turns_right = walks & is_behind
         turns_to_it = walks & ~is_ahead & ~is_behind
-        orientation[is_there] = NORTH
-        position[moves] += FORWARD[cheapest[moves]]
-        orientation[turns_right] += 1
-        orientation[turns_to_it] = cheapest[turns_to_it]
-        orientation %= 4
+        self.orientation[is_there] = NORTH
+        self.position[moves] += FORWARD[cheapest[moves]]
+        self.orientation[turns_right] += 1
+        self.orientation[turns_to_it] = cheapest[turns_to_it]
+        self.orientation %= 4
 
-        is_now_there = (position == waypoint).all(axis=1)
-        ends = goes & is_now_there & (orientation == NORTH)
-        self.last_waypoint[ends, agent] = action[ends]
+        is_now_there = is_same_cell(self.position, waypoint)
+        ends = goes & is_now_there & (self.orientation == NORTH)
+        self.last_waypoint[ends] = action[ends]
         return ends
 
-    def _cheapest_direction(self, position, orientation, waypoint):
-        """The direction, int64 [N], of the neighbour cell with the lowest cost for Go-to, the first of equals."""
-        neighbour = position[:, None] + FORWARD  # [N, directions, (x, y)]
-        distance = np.abs(neighbour - waypoint[:, None]).sum(axis=2)
-        quarter_turns = (np.arange(4) - orientation[:, None]) % 4  # to the right
+    def _cheapest_direction(self, waypoint):
+        """The direction, int64 [N, agents], of the neighbour cell with the lowest cost, the first of equals."""
+        x = self.position[:, :, :1] + FORWARD[:, 0]  # [N, agents, directions], of the neighbour cells
+        y = self.position[:, :, 1:] + FORWARD[:, 1]
+        distance = np.abs(x - waypoint[:, :, :1]) + np.abs(y - waypoint[:, :, 1:])
+        quarter_turns = (np.arange(4) - self.orientation[:, :, None]) % 4  # to the right
         cost = distance + TURN_COST[quarter_turns]
-        in_box_row = neighbour[:, :, 1] == self.box_y[:, :1]  # the row of small box 0
-        in_box_column = np.isin(neighbour[:, :, 0], self.cell_x)
+        in_box_row = y == self.box_y[:, :1, None]  # the row of small box 0
+        in_box_column = np.zeros(x.shape, bool)
+        for box_x in self.cell_x:
+            in_box_column |= x == box_x
         cost[in_box_row & in_box_column] = np.inf
-        return cost.argmin(axis=1)
+        return cost.argmin(axis=2)
 
     def _push(self, agent, action):
         """One step of Push in the environments where the agent runs it and is not locked onto the big box.
@@ -333,21 +339,21 @@ class BoxPushing(MacroVectorEnv):
         ends = penalised | box_arrives | reaches_boundary
         return ends, penalised
 
-    def _turn_or_stay(self, agent, action):
-        """Turn-left, Turn-right and Stay; returns where the agent runs one of them, bool [N]."""
-        orientation = self.orientation[:, agent]  # a view: writing to it turns the agent
+    def _turn_or_stay(self, action):
+        """Turn-left, Turn-right and Stay of both agents; returns where they run one of them, bool [N, agents]."""
         turns_left = action == TURN_LEFT
         turns_right = action == TURN_RIGHT
         stays = action == STAY
-        orientation[turns_left] -= 1
-        orientation[turns_right] += 1
-        orientation %= 4
+        self.orientation[turns_left] -= 1
+        self.orientation[turns_right] += 1
+        self.orientation %= 4
         return turns_left | turns_right | stays
 
     def _push_big_box(self):
         """The big box and both agents move one cell north where the agents are locked onto it."""
-        self.position[self.pushing_big, :, 1] += 1
-        self.box_y[self.pushing_big, BIG] += 1
+        step = np.where(self.pushing_big, 1.0, 0.0)
+        self.position[:, :, 1] += step[:, None]
+        self.box_y[:, BIG] += step
 
     # ---- what is in a cell; each environment has its own, float64 [N, (x, y)] -----------------------------------
     def _small_boxes_at(self, cell):
@@ -363,8 +369,9 @@ class BoxPushing(MacroVectorEnv):
         return same_x & same_y
 
     def _is_outside(self, cell):
-        """Whether the cell is outside the grid, bool [N]."""
-        return ((cell < 0) | (cell > self.grid)).any(axis=1)
+        """Whether the cell is outside the grid. This one takes cells [..., (x, y)] and returns bool [...]."""
+        is_outside = (cell < 0) | (cell > self.grid)
+        return is_outside[..., 0] | is_outside[..., 1]
 
     # ---- observations, the state and the picture ----------------------------------------------------------------
     def _observe(self, start):
@@ -372,21 +379,21 @@ class BoxPushing(MacroVectorEnv):
         if start:
             obs[:] = (0, 0, 1, 0, 0)  # "nothing"
             return obs
+        front = self.position + FORWARD[self.orientation]  # [N, agents, (x, y)]
         for agent in range(2):
-            front = self.position[:, agent] + FORWARD[self.orientation[:, agent]]
-            small_box = self._small_boxes_at(front).any(axis=1)
-            big_box = self._big_box_at(front)
-            boundary = self._is_outside(front)
-            teammate = (self.position[:, 1 - agent] == front).all(axis=1)
-            empty = ~(small_box | big_box | boundary | teammate)
-            obs[:, agent] = np.stack([small_box, big_box, empty, boundary, teammate], axis=1)
+            obs[:, agent, 0] = self._small_boxes_at(front[:, agent]).any(axis=1)
+            obs[:, agent, 1] = self._big_box_at(front[:, agent])
+        obs[:, :, 3] = self._is_outside(front)
+        obs[:, :, 4] = is_same_cell(front, self.position[:, ::-1])  # where the teammate is
+        obs[:, :, 2] = ~obs.any(axis=2)  # nothing of these
         return obs
 
     def _state(self):
         facing = self.orientation[:, :, None] == np.arange(4)  # [N, agents, orientations]
         agents = np.concatenate([self.position / self.grid, facing], axis=2)
-        box_x = np.tile(self.box_x, (self.num_envs, 1))
-        boxes = np.stack([box_x, self.box_y], axis=2) / self.grid  # [N, boxes, (x, y)]
+        boxes = np.zeros((self.num_envs, 3, 2))  # [N, boxes, (x, y)]
+        boxes[:, :, 0] = self.box_x / self.grid
+        boxes[:, :, 1] = self.box_y / self.grid
         last_waypoint = self.last_waypoint[:, :, None] == np.arange(4)  # [N, agents, waypoints]
         parts = [agents, boxes, last_waypoint, self.pushing_big]
         flat = [part.reshape(self.num_envs, -1) for part in parts]

@@ -49,8 +49,10 @@ def numbers(name, value, shape=(), low=-np.inf, high=np.inf):
 
 
 def whole(name, value, shape=(), low=1, high=np.inf):
-    """Like `numbers`, but for whole numbers, by default of at least 1. Returns an int or an int64 array."""
+    """Like `numbers`, but for whole numbers from 1 (by default) to 10**15. Returns an int or an int64 array."""
     number = numbers(name, value, shape, low, high)
+    if np.any(np.asarray(number) > 10**15):
+        raise ValueError(f"{name} must be at most 10**15, got {shown(value)}")
     if np.any(np.mod(number, 1) != 0):
         raise ValueError(f"{name} must be whole, got {shown(value)}")
     return number.astype(np.int64) if shape else int(number)

@@ -11,6 +11,10 @@ from gymnasium.vector.utils import batch_space
 from envs import checks
 
 
+class TaskError(ValueError):
+    """What a domain says of its task cannot be: another shape, a number that is not finite, an empty initiation set."""
+
+
 class MacroVectorEnv(VectorEnv, ABC):
     """A batch of cooperative environments whose agents run macro-actions of different lengths.
 
@@ -37,13 +41,15 @@ class MacroVectorEnv(VectorEnv, ABC):
             initiation set. An agent that is busy can only go on with the macro-action it runs.
         elapsed: int64 [N], steps taken in the episode.
         episode_return: float64 [N], the undiscounted return of the episode so far.
+        cut: bool [N], False before each step. `_advance` may set it to True where the episode is truncated in this step
+            by something else than the horizon.
         over: bool [N], whether the episode has ended. It is True before the first reset, too.
         success: bool [N], whether the task's goal was reached in the last step.
-        cut: bool [N], whether something else than the horizon cut the episode in the last step. `_advance` may set it.
 
     A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`. If its
     macro-actions have initiation sets, it overrides `_can_start`. It names the arrays that hold its simulator state in
-    `sim_arrays`; the first axis of each is the environment.
+    `sim_arrays`; the first axis of each is the environment. What these methods return is checked in every step and
+    reset: another shape or dtype, or a number that is not finite, raises a ValueError.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8, "autoreset_mode": AutoresetMode.DISABLED}
@@ -64,8 +70,9 @@ class MacroVectorEnv(VectorEnv, ABC):
         Raises:
             ValueError: an argument is out of range.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and not (isinstance(render_mode, str) and render_mode in modes):
+            raise ValueError(f"render_mode must be None or one of {modes}, got {checks.shown(render_mode)}")
         num_envs = checks.whole("num_envs", num_envs)
         self.num_envs = num_envs
         self.horizon = checks.whole("horizon", horizon)
@@ -81,16 +88,20 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.single_action_space = gym.spaces.MultiDiscrete(self.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.own_actions = np.arange(max(self.n_actions)) < np.array(self.n_actions)[:, None]
+        self._numbers = np.arange(max(self.n_actions))  # of the macro-actions of an agent that has A
+        self.own_actions = self._numbers < np.array(self.n_actions)[:, None]
+        self._own_everywhere = np.broadcast_to(self.own_actions, (num_envs, *self.own_actions.shape))  # read-only
+        self._env_index = np.arange(num_envs)[:, None]
+        self._agent_index = np.arange(self.n_agents)
 
         self.macro_done = np.ones((num_envs, self.n_agents), bool)
         self.macro_action = np.full((num_envs, self.n_agents), -1)
         self.elapsed = np.zeros(num_envs, np.int64)
         self.episode_return = np.zeros(num_envs)
+        self.cut = np.zeros(num_envs, bool)
         self.over = np.ones(num_envs, bool)
         self.success = np.zeros(num_envs, bool)
-        self.cut = np.zeros(num_envs, bool)
-        self.available = np.tile(self.own_actions, (num_envs, 1, 1))
+        self.available = self._own_everywhere.copy()
         self._obs = np.zeros((num_envs, *self.single_observation_space.shape), np.float32)
 
     # ---- what a domain implements -------------------------------------------------------------------------------
@@ -103,8 +114,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         """Takes one step of the macro-action that each agent runs.
 
         `macro_done` is still that of the step before: where it is True, the agent starts its `macro_action` in this
-        step. `elapsed` already counts this step. `cut` is False everywhere: set it where the episode is cut (truncated)
-        in this step by something else than the horizon.
+        step. `elapsed` already counts this step.
 
         Returns:
             rewards float64 [N]
@@ -127,7 +137,7 @@ class MacroVectorEnv(VectorEnv, ABC):
 
         By default these are all that it has. A free agent must have at least one that it can start.
         """
-        return np.broadcast_to(self.own_actions, self.available.shape)
+        return self._own_everywhere
 
     def _restore(self):
         """Called by `load_state` after the arrays are set. A domain that holds more than arrays makes it from them."""
@@ -142,16 +152,21 @@ class MacroVectorEnv(VectorEnv, ABC):
 
         Args:
             seed: an int reseeds the generator of the whole batch, None goes on with the one in use.
-            options: `{"reset_mask": bool [N]}` resets only those environments and leaves the others as they are.
+            options: `{"reset_mask": bool [N]}` resets only those environments and leaves the others as they are. There
+                is no other option.
 
         Returns:
             obs float32 [N, n, d] and infos: those of `step`. `macro_action` is -1 in the environments that were reset.
 
         Raises:
-            ValueError: the mask has another shape or dtype.
+            ValueError: the mask has another shape or dtype, or there is another option.
+            TaskError: the domain's observations or states are not what they must be.
         """
         super().reset(seed=seed)
-        mask = (options or {}).get("reset_mask")
+        options = options or {}
+        if not options.keys() <= {"reset_mask"}:
+            raise ValueError(f"the only option of a reset is 'reset_mask', got {list(options)}")
+        mask = options.get("reset_mask")
         if mask is None:
             mask = np.ones(self.num_envs, bool)
         mask = np.asarray(mask)
@@ -164,7 +179,8 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.episode_return[mask] = 0.0
         self.over[mask] = False
         self.success[mask] = False
-        self._obs[mask] = self._observe(start=True)[mask]
+        obs = self._checked("_observe", self._observe(start=True), np.float32, self._obs.shape)
+        self._obs[mask] = obs[mask]
         self._update_available()
         return self._obs.copy(), self._infos()
 
@@ -186,6 +202,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         Raises:
             ValueError: the array has another shape or is not of integers, an environment's episode has ended, or a free
                 agent's macro-action is out of range or not in its initiation set.
+            TaskError: what the domain returns is not what it must be.
         """
         actions = np.asarray(actions)
         if actions.shape != self.macro_done.shape or actions.dtype.kind not in "iu":
@@ -201,14 +218,20 @@ class MacroVectorEnv(VectorEnv, ABC):
         # "unsafe" lets actions be of any integer dtype. They are in range where they are copied.
         np.copyto(self.macro_action, actions, where=self.macro_done, casting="unsafe")
         self.elapsed += 1
-        self.cut[:] = False
+        self.cut = np.zeros(self.num_envs, bool)
         rewards, terminations, ended, success = self._advance()
+        self._checked("_advance: rewards", rewards, np.float64, self.elapsed.shape)
+        self._checked("_advance: terminations", terminations, bool, self.elapsed.shape)
+        self._checked("_advance: ended", ended, bool, self.macro_done.shape)
+        self._checked("_advance: success", success, bool, self.elapsed.shape)
+        self._checked("cut", self.cut, bool, self.elapsed.shape)
         self.success = success.copy()  # a later reset writes into it, and a domain may return one array for both
-        truncations = ((self.elapsed >= self.horizon) | self.cut) & ~terminations
+        truncations = (self.cut | (self.elapsed >= self.horizon)) & ~terminations
         self.over = terminations | truncations
         self.macro_done = ended | self.over[:, None]
         self.episode_return += rewards
-        np.copyto(self._obs, self._observe(start=False), where=self.macro_done[:, :, None])
+        obs = self._checked("_observe", self._observe(start=False), np.float32, self._obs.shape)
+        np.copyto(self._obs, obs, where=self.macro_done[:, :, None])
         self._update_available()
         return self._obs.copy(), rewards, terminations, truncations, self._infos()
 
@@ -220,9 +243,9 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     def _check_free_agents(self, actions):
         """Raises ValueError for the first free agent that is given a macro-action which it cannot start."""
-        in_range = (actions >= 0) & (actions < self.own_actions.shape[1])
+        in_range = (actions >= 0) & (actions < len(self._numbers))
         index = np.where(in_range, actions, 0)
-        is_available = np.take_along_axis(self.available, index[:, :, None], axis=2)[:, :, 0]  # [N, n]
+        is_available = self.available[self._env_index, self._agent_index, index]  # [N, n]
         bad = self.macro_done & ~(in_range & is_available)
         if not bad.any():
             return
@@ -240,24 +263,43 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     def _update_available(self):
         """Sets `available`: for a free agent its initiation set, for a busy one only its running macro-action."""
-        can_start = self._can_start() & self.own_actions
-        is_running = self.macro_action[:, :, None] == np.arange(self.own_actions.shape[1])  # [N, n, A]
-        self.available = np.where(self.macro_done[:, :, None], can_start, is_running)
-        is_empty = ~self.available.any(axis=2)  # [N, n]
-        if is_empty.any():
-            is_stuck = is_empty & ~self.over[:, None]
-            if is_stuck.any():
-                env, agent = np.argwhere(is_stuck)[0]
-                raise ValueError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
-            # Nobody chooses in an episode that is over. An empty set is filled there, so that one can mask with it.
-            self.available |= is_empty[:, :, None] & self.own_actions
+        is_running = self.macro_action[:, :, None] == self._numbers  # [N, n, A]
+        self.available = np.where(self.macro_done[:, :, None], self._initiation_sets(), is_running)
+
+    def _initiation_sets(self):
+        """What `_can_start` returns, within what agents have. Raises TaskError if a free agent can start nothing."""
+        can_start = self._can_start()
+        if can_start is self._own_everywhere:
+            return can_start  # the default needs no check
+        self._checked("_can_start", can_start, bool, self.available.shape)
+        can_start = can_start & self.own_actions
+        is_empty = ~can_start.any(axis=2)  # [N, n]
+        is_stuck = is_empty & self.macro_done & ~self.over[:, None]
+        if is_stuck.any():
+            env, agent = np.argwhere(is_stuck)[0]
+            raise TaskError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
+        # Nobody chooses in an episode that is over. An empty set is filled there, so that one can mask with it.
+        return can_start | (is_empty[:, :, None] & self.own_actions)
+
+    def _checked(self, name, array, dtype, shape):
+        """Returns an array of the domain's. Raises TaskError if it is not of this dtype and shape, or not finite."""
+        domain = type(self).__name__
+        if not isinstance(array, np.ndarray) or array.dtype != dtype or array.shape != shape:
+            got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+            raise TaskError(f"{domain}.{name} must be {np.dtype(dtype)} {shape}, got {got}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            index = tuple(np.argwhere(~np.isfinite(array))[0])
+            agent = f"agent {index[1]} of " if array.ndim == 3 else ""
+            where = f"{agent}environment {index[0]} at step {self.elapsed[index[0]]}"
+            raise TaskError(f"{domain}.{name} must be finite, got {array[index]} for {where}")
+        return array
 
     def _infos(self):
         return {
             "macro_done": self.macro_done.copy(),
             "macro_action": self.macro_action.copy(),
             "available": self.available.copy(),
-            "state": self._state(),
+            "state": self._checked("_state", self._state(), np.float32, (self.num_envs, self.state_size)),
             "success": self.success.copy(),
         }
 
@@ -268,13 +310,10 @@ class MacroVectorEnv(VectorEnv, ABC):
         return base + self.sim_arrays
 
     def save_state(self):
-        """All that the simulator needs to go on, a dict of arrays.
-
-        Its entry "np_random" is the state of the random generator: JSON, as an array of bytes.
-        """
-        arrays = {name: getattr(self, name).copy() for name in self._checkpointed()}
-        generator = json.dumps(self.np_random.bit_generator.state)
-        return arrays | {"np_random": np.frombuffer(generator.encode(), np.uint8).copy()}
+        """All that the simulator needs to go on: for each array its bytes, and as "np_random" the generator's JSON."""
+        state = {name: getattr(self, name).tobytes() for name in self._checkpointed()}
+        state["np_random"] = json.dumps(self.np_random.bit_generator.state)
+        return state
 
     def load_state(self, saved):
         """Continues from what `save_state` returned.
@@ -283,14 +322,19 @@ class MacroVectorEnv(VectorEnv, ABC):
             obs and infos, those of the last reset or step before it was saved.
 
         Raises:
-            ValueError: it was saved by another domain, or by one with other sizes or another number of environments.
+            ValueError: it was saved by another domain, or by one with other sizes or another number of environments, or
+                an entry is missing.
         """
-        for name in self._checkpointed():
-            if name not in saved or np.shape(saved[name]) != getattr(self, name).shape:
-                raise ValueError(f"the saved state is of another environment: {name!r} is missing or of another shape")
-        for name in self._checkpointed():
-            setattr(self, name, np.asarray(saved[name]).copy())
-        self.np_random.bit_generator.state = json.loads(bytes(np.asarray(saved["np_random"])))
+        arrays = {name: getattr(self, name) for name in self._checkpointed()}
+        for name, array in arrays.items():
+            if len(saved.get(name, b"")) != array.nbytes:
+                raise ValueError(f"the saved state is of another environment: {name!r} is missing or of another size")
+        if "np_random" not in saved:
+            raise ValueError("the saved state has no random generator, 'np_random'")
+        for name, array in arrays.items():
+            loaded = np.frombuffer(saved[name], array.dtype).reshape(array.shape)
+            setattr(self, name, loaded.copy())
+        self.np_random.bit_generator.state = json.loads(saved["np_random"])
         self._restore()
         self._update_available()
         return self._obs.copy(), self._infos()
@@ -299,10 +343,13 @@ class MacroVectorEnv(VectorEnv, ABC):
 class SingleMacroEnv(gym.Env):
     """One environment of a domain as a `gymnasium.Env`: a batch of one, without the batch's axis.
 
-    `obs` is float32 [n, d] and the reward a float. The info has the entries of `MacroVectorEnv.step`.
+    `obs` is float32 [n, d] and the reward a float. The info has the entries of `MacroVectorEnv.step`: arrays, but
+    `success` is a bool. `reset` takes the options of the batch. `spec.max_episode_steps` is the horizon. The batch
+    truncates by itself, so Gymnasium adds no `TimeLimit`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
+    _spec = None
 
     def __init__(self, vector_env):
         self.vector_env = vector_env
@@ -310,15 +357,27 @@ class SingleMacroEnv(gym.Env):
         self.observation_space = vector_env.single_observation_space
         self.action_space = vector_env.single_action_space
 
+    @property
+    def spec(self):
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec):  # Gymnasium sets it
+        spec.max_episode_steps = self.vector_env.horizon
+        self._spec = spec
+
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)  # Gymnasium asks for it; vector_env has a generator of its own
-        obs, infos = self.vector_env.reset(seed=seed)
-        return obs[0], {key: value[0] for key, value in infos.items()}
+        obs, infos = self.vector_env.reset(seed=seed, options=options)
+        return obs[0], self._info(infos)
 
     def step(self, action):
         obs, reward, terminated, truncated, infos = self.vector_env.step(np.asarray(action)[None])
-        info = {key: value[0] for key, value in infos.items()}
-        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(infos)
+
+    def _info(self, infos):
+        """The entries of the only environment. What is a number for each environment becomes a Python number."""
+        return {name: array[0] if array.ndim > 1 else array[0].item() for name, array in infos.items()}
 
     def render(self):
         frames = self.vector_env.render()

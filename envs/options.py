@@ -15,10 +15,10 @@ import numpy as np
 from gymnasium.spaces import Box, Tuple, flatdim, flatten
 
 from envs import checks
-from envs.core import MacroVectorEnv
+from envs.core import MacroVectorEnv, TaskError
 
 
-class OptionError(ValueError):
+class OptionError(TaskError):
     """An option is wrong. The message is one line with the option, the agent and the step."""
 
 

@@ -77,9 +77,36 @@ HEADINGS = [  # (dx, dy) in a picture of the orientations of Box Pushing
 
 
 @cache
-def _font(size):
-    """The font that comes with Pillow, in a size."""
-    return ImageFont.load_default(size)
+def find_font(words):
+    """A font for words that are not only ASCII, a FontEntry of Matplotlib with a `name` and a file `fname`.
+
+    DejaVu Sans, which comes with Matplotlib, has most alphabets. For letters that it lacks, the font is another one of
+    this machine that has all of these. If there is none, they are drawn as boxes.
+    """
+    from matplotlib import font_manager  # here, since the names of most tasks are ASCII
+
+    def rank(font):
+        is_regular = font.style == "normal" and font.stretch == "normal" and font.weight == 400
+        return font.name != "DejaVu Sans", not is_regular
+
+    fonts = [font for font in font_manager.fontManager.ttflist if not font.name.startswith("Last Resort")]  # only boxes
+    fonts.sort(key=rank)
+    missing = set(map(ord, words)) - _letters(fonts[0].fname)
+    return next((font for font in fonts if missing <= _letters(font.fname)), fonts[0])
+
+
+@cache
+def _letters(file):
+    """The code points of the letters that a font has."""
+    from matplotlib import ft2font
+
+    return ft2font.FT2Font(file).get_charmap().keys()
+
+
+@cache
+def _font(size, file=None):
+    """A font in a size. By default it is the one that comes with Pillow, which has no letters beyond ASCII."""
+    return ImageFont.truetype(file, size) if file else ImageFont.load_default(size)
 
 
 @dataclass
@@ -149,10 +176,11 @@ class Canvas:
         With "l" x is the left end of the words, with "m" their middle and with "r" their right end.
         """
         font_size = max(size * self.unit, 10)
-        font = _font(font_size)
+        words = str(words)
+        font = _font(font_size) if words.isascii() else _font(font_size, find_font(words).fname)
         stroke = round(font_size / 44) if bold else 0
         place = self._enlarge(x, y)
-        self.draw.text(place, str(words), colour, font, anchor + "m", stroke_width=stroke)
+        self.draw.text(place, words, colour, font, anchor + "m", stroke_width=stroke)
 
     def pixels(self):
         """The finished picture, uint8 [height, width, 3]."""

@@ -181,6 +181,8 @@ class Warehouse(MacroVectorEnv):
       macro-action has the number of the place to which it leads.
     - waypoints float64 [R, H + 2, (x, y)], where each robot finds these places (all but "nowhere yet")
     - task_steps int [1 + R + 3], how long each of the arm's macro-actions takes
+    - passes_to bool [1 + R + 3, R] and searches_for bool [1 + R + 3, 3], the robot to which each of the arm's
+      macro-actions passes and the tool for which it searches, one-hot
 
     The simulator's state is in these arrays:
 
@@ -189,7 +191,8 @@ class Warehouse(MacroVectorEnv):
     - under_way bool [N, R], whether the robot was still short of its waypoint after the last step
     - waited int [N, R], for how many steps the robot has waited at the table. The count is set to 0 when a Pass serves
       the robot and in each step in which the robot is under way. It is set to 1 when a Get-Tool ends in vain, because
-      its last step also counts as the first one of a next wait.
+      its last step also counts as the first one of a next wait. In a layout of your own a robot can go elsewhere in one
+      step and come back in another one. It is never under way then, so the count stays.
     - carried int [N, R, 3], copies of each tool
     - staged int [N, C], queue of tools, oldest first, -1 for an empty place
     - found int [N, 3], copies of each tool found so far
@@ -256,8 +259,8 @@ class Warehouse(MacroVectorEnv):
         staging_capacity=2,
     ):
         """Raises ValueError: the layout is unknown, or an argument is out of range or does not fit the others."""
-        if layout not in list(LAYOUTS):  # a list: an argument without a hash would make a dict raise TypeError
-            raise ValueError(f"unknown layout {layout!r}; valid layouts: {' '.join(LAYOUTS)}")
+        if not isinstance(layout, str) or layout not in LAYOUTS:
+            raise ValueError(f"unknown layout {checks.shown(layout)}; valid layouts: {' '.join(LAYOUTS)}")
 
         self.layout = layout
         self.primitive = checks.flag("primitive", primitive)
@@ -321,6 +324,9 @@ class Warehouse(MacroVectorEnv):
         # The arm's macro-actions and how long they take.
         durations = [self.arm_wait_steps] + [self.pass_steps] * robots + [self.search_steps] * TOOLS
         self.task_steps = np.array(durations)
+        arm_actions = np.arange(len(durations))
+        self.passes_to = one_hot(arm_actions - 1, robots)
+        self.searches_for = one_hot(arm_actions - 1 - robots, TOOLS)
         pass_names = [f"Pass-to-M({robot})" for robot in range(robots)]
         search_names = [f"Search-Tool({tool})" for tool in range(TOOLS)]
         arm_names = ["Wait-M", *pass_names, *search_names]
@@ -403,7 +409,8 @@ class Warehouse(MacroVectorEnv):
         """Moves each robot one step towards its waypoint and returns whether it stands on it now, bool [N, R]."""
         waypoint = self.waypoints[np.arange(self.n_robots), destination]  # [N, R, (x, y)]
         way = waypoint - self.position
-        distance = np.round(np.linalg.norm(way, axis=2), 2)  # to the centimetre, as in the published benchmark
+        length = np.sqrt(way[:, :, 0] ** 2 + way[:, :, 1] ** 2)
+        distance = np.round(length, 2)  # to the centimetre, as in the published benchmark
         arrived = distance <= self.robot_speed
         share = self.robot_speed / np.maximum(distance, self.robot_speed)  # the part of the way to go now
         moved = self.position + share[:, :, None] * way
@@ -434,14 +441,15 @@ class Warehouse(MacroVectorEnv):
         """Robots that have reached a workshop give its human the next tool; returns the rewards, float64 [N]."""
         visits = arrived[:, :, None] & one_hot(destination, self.n_humans)  # [N, R, H]
         needed = np.minimum(self.phase, TOOLS - 1)  # [N, H]: in phase p tool p is next; not used in the last phase
-        receives = np.zeros_like(self.has_next_tool)
-        for robot in range(self.n_robots):  # one after the other: two may bring a human the same tool
-            carries = np.take_along_axis(self.carried[:, robot], needed, axis=1) > 0  # [N, H]
-            delivers = visits[:, robot] & carries & ~self.has_next_tool
-            env, human = np.nonzero(delivers)
-            self.carried[env, robot, needed[env, human]] -= 1  # a robot visits one workshop, so no env occurs twice
-            self.has_next_tool |= delivers
-            receives |= delivers
+        env = np.arange(self.num_envs)[:, None, None]
+        robot = np.arange(self.n_robots)[:, None]
+        carries = self.carried[env, robot, needed[:, None]] > 0  # [N, R, H]
+        brings = visits & carries & ~self.has_next_tool[:, None]
+        delivers = brings & (brings.cumsum(axis=1) == 1)  # if two bring a human the same tool, the first one gives it
+        env, robot, human = np.nonzero(delivers)
+        self.carried[env, robot, needed[env, human]] -= 1  # a robot visits one workshop, so no pair occurs twice
+        receives = delivers.any(axis=1)
+        self.has_next_tool |= receives
         late = self.clock <= 0
         value = np.where(late, self.delivery_reward - self.late_penalty, self.delivery_reward)
         return np.where(receives, value, 0.0).sum(axis=1)
@@ -450,7 +458,7 @@ class Warehouse(MacroVectorEnv):
         """Takes one step of the arm's macro-action; returns where it ends, bool [N]."""
         starts = self.macro_done[:, -1]
         is_waiting = (self.location == self.table_place) & (self.waited >= 1)  # [N, R]
-        can_pass = (self._receiver(arm_action) & is_waiting).any(axis=1)
+        can_pass = (self.passes_to[arm_action] & is_waiting).any(axis=1)
         self.pass_ready = np.where(starts, can_pass, self.pass_ready)
         self.arm_left = np.where(starts, self.task_steps[arm_action], self.arm_left) - 1
         return self.arm_left == 0
@@ -459,7 +467,7 @@ class Warehouse(MacroVectorEnv):
         """Where a Search ends: puts a copy of the tool, if one is left, at the end of the queue, if there is room."""
         n_staged = self._n_staged()
         has_room = n_staged < self.staging_capacity
-        search_ends = self._sought(arm_action) & arm_ends[:, None]  # [N, TOOLS]
+        search_ends = self.searches_for[arm_action] & arm_ends[:, None]  # [N, TOOLS]
         finds = search_ends & has_room[:, None] & (self.found < self.copies)
         env, tool = np.nonzero(finds)
         self.found[env, tool] += 1
@@ -471,7 +479,7 @@ class Warehouse(MacroVectorEnv):
         Returns:
             served bool [N, R], whether the Pass ends the robot's Get-Tool, and fails bool [N], whether the Pass fails.
         """
-        pass_ends = self._receiver(arm_action) & arm_ends[:, None]  # [N, R]
+        pass_ends = self.passes_to[arm_action] & arm_ends[:, None]  # [N, R]
         # A robot on Get-Tool with a count of 1 or more is at the table, because under way the count is 0.
         served = pass_ends & self.pass_ready[:, None] & gets_tool & (self.waited >= 1)
         fails = (pass_ends & ~served).any(axis=1)
@@ -496,14 +504,6 @@ class Warehouse(MacroVectorEnv):
         self.has_next_tool[begins] = self.phase[begins] == LAST_PHASE  # it needs no other tool
 
     # ---- small helpers ------------------------------------------------------------------------------------------
-    def _receiver(self, arm_action):
-        """The robot to which a Pass goes, one-hot [N, R]; all False for the arm's other macro-actions."""
-        return one_hot(arm_action - 1, self.n_robots)
-
-    def _sought(self, arm_action):
-        """The tool for which a Search looks, one-hot [N, TOOLS]; all False for the arm's other macro-actions."""
-        return one_hot(arm_action - 1 - self.n_robots, TOOLS)
-
     def _n_staged(self):
         """How many tools are staged, int [N]."""
         return (self.staged != NO_TOOL).sum(axis=1)
@@ -558,7 +558,7 @@ class Warehouse(MacroVectorEnv):
         humans = np.concatenate([phase, clock[..., None], self.has_next_tool[..., None]], axis=2)
 
         parts = [robots.reshape(self.num_envs, -1), *arm, humans.reshape(self.num_envs, -1)]
-        return np.concatenate(parts, axis=1).astype(np.float32)
+        return np.concatenate(parts, axis=1, dtype=np.float32)
 
     def _draw(self, index):
         from envs.rendering import draw_warehouse

@@ -139,6 +139,7 @@ BY_HAND = SimpleNamespace(
     num_envs=1,
     n_agents=2,
     n_actions=[2, 2],
+    obs_sizes=[2, 2],
     horizon=6,
     single_observation_space=SimpleNamespace(shape=(2, 2)),
 )

@@ -22,7 +22,9 @@ class MatrixGame(MacroVectorEnv):
     def __init__(self, num_envs=1, payoff=NON_MONOTONIC, tell=False, render_mode=None):
         names = [["a", "b", "c"]] * 2
         width = 9 if tell else 3
-        super().__init__(num_envs, names, np.zeros((2, width)), np.ones((2, width)), (3, 3), width, 10, render_mode)
+        super().__init__(
+            num_envs, names, np.zeros((2, width)), np.ones((2, width)), (width, width), width, 10, render_mode
+        )
         self.payoff = np.array(payoff, float)
         self.tell = tell
         self.first_choice = np.zeros((num_envs, 2), int)

@@ -22,9 +22,9 @@ SHORT = dict(
     eval_episodes=2,
 )
 REPLAY = dict(learning_starts=200, train_frequency=40, batch_size=8)  # for scripts with a replay buffer
-CHARTS = {"charts/episodic_return", "charts/epsilon"}
+CHARTS = {"charts/episodic_return"}
 EVAL = {"eval/return", "eval/discounted_return", "eval/length", "eval/success"}
-LOSSES = {"losses/td_loss", "losses/q_values", "losses/grad_norm"}
+LOSSES = {"losses/td_loss", "losses/q_values"}
 
 
 def short(script, env_id, folder, **options):

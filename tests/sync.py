@@ -64,9 +64,9 @@ OWN_LINES = {
 
         buffer.add_step(state, args.reward_scale * rewards, np.where(terminations, 0.0, args.gamma))
 
-            loss, q, _ = td_loss(
-                utilities, target_utilities, learner["mixer"], target["mixer"], batch, args, hysteresis
-            )
+    mixer = learner["mixer"]
+
+            loss, q, _ = td_loss(utilities, target_utilities, mixer, target["mixer"], batch, args, hysteresis)
 """,
     "avf_vdn": """
             loss, q, _ = td_loss(utilities, target_utilities, batch, args, hysteresis)
@@ -75,13 +75,13 @@ OWN_LINES = {
             loss, q, _ = own_loss(utilities, target_utilities, batch, args, hysteresis)
 """,
     f"{AVF} dec_maddrqn": """
-            utilities = utilities_at_rows(learner["agents"], batch)
+            utilities = utilities_at_rows(agents, batch)
             target_utilities = utilities_at_rows(target["agents"], batch)
 """,
     "cen_maddrqn": """
-            values = values_at_rows(learner["agents"], batch)
+            values = values_at_rows(agents, batch)
             target_values = values_at_rows(target["agents"], batch)
-            loss, q, _ = td_loss(values, target_values, learner["agents"], batch, args, hysteresis)
+            loss, q, _ = td_loss(values, target_values, agents, batch, args, hysteresis)
 """,
     Q_LEARNING: """
     seeds = np.random.SeedSequence(args.seed).generate_state(5, np.uint64).tolist()
@@ -93,7 +93,7 @@ OWN_LINES = {
 
     buffer = ReplayBuffer(env, args.buffer_size)
 
-        explore_rng.bit_generator.state, replay_rng.bit_generator.state = saved["rngs"]
+            explore_rng.bit_generator.state, replay_rng.bit_generator.state = saved["rngs"]
 
         phase = (step - args.learning_starts) / args.exploration_timesteps
 
@@ -108,7 +108,7 @@ OWN_LINES = {
 
             for slow, fast in zip(target.parameters(), learner.parameters(), strict=True):
 
-            if updates % 100 == 0:
+            if not step // args.train_frequency % 100:  # one in a hundred
                 writer.add_scalar("losses/td_loss", loss, step)
                 writer.add_scalar("losses/q_values", q.mean(), step)
 
@@ -122,7 +122,7 @@ OWN_LINES = {
 
     buffer = EpisodeBuffer(env)
 
-        explore_rng.bit_generator.state = saved["explore_rng"]
+            explore_rng.bit_generator.state = saved["explore_rng"]
 
         phase = (step - args.random_timesteps) / args.exploration_timesteps
 
@@ -133,7 +133,7 @@ OWN_LINES = {
 
             batch = make_batch(buffer.ended, args.device)
             buffer.ended.clear()
-            policy = soft_policy(logits_at_rows(learner["agents"], batch), batch["available"], epsilon)
+            policy = soft_policy(logits_at_rows(agents, batch), batch["available"], epsilon)
             values = learner["critics"](batch)  # [B, T, n]
             returns = own_returns(target(batch), batch, args.n_step)
             losses = actor_critic_loss(policy, values, returns, batch, args.entropy_coef, hysteresis)
@@ -143,11 +143,10 @@ OWN_LINES = {
 
             for slow, fast in zip(target.parameters(), learner["critics"].parameters(), strict=True):
 
-            if updates % 10 == 0:
-                writer.add_scalar("losses/actor_loss", actor_loss, step)
-                writer.add_scalar("losses/critic_loss", critic_loss, step)
-                writer.add_scalar("losses/entropy", entropy, step)
-                writer.add_scalar("losses/values", values[batch["valid"]].mean(), step)
+            writer.add_scalar("losses/actor_loss", actor_loss, step)
+            writer.add_scalar("losses/critic_loss", critic_loss, step)
+            writer.add_scalar("losses/entropy", entropy, step)
+            writer.add_scalar("losses/values", values[batch["valid"]].mean(), step)
 
                 explore_rng=explore_rng.bit_generator.state,
 """,

@@ -70,7 +70,7 @@ BEST_RETURN = 8.0
 @pytest.fixture(autouse=True)
 def orchard(monkeypatch):
     """Makes the task known."""
-    monkeypatch.setitem(envs._TASKS, "orchard", (Orchard, {}))
+    monkeypatch.setitem(envs._TASKS, "orchard", (Orchard, {}, {}))
 
 
 # ---- the step contract --------------------------------------------------------------------------------------------

@@ -336,7 +336,7 @@ def test_what_busy_agents_add_with_the_mixers(script, mask_ongoing):
     """
     torch.manual_seed(0)
     task = SimpleNamespace(n_agents=2, n_actions=[2, 2], state_size=1, own_actions=np.ones((2, 2), bool))
-    task.single_observation_space = SimpleNamespace(shape=(2, 1))
+    task.obs_sizes = [1, 1]
     settings = dict(mask_ongoing=mask_ongoing) if script is avf_qplex else {}
     learner = script.make_learner(script.Args(**settings), task)
     target = script.make_learner(script.Args(**settings), task)

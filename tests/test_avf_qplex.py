@@ -496,7 +496,7 @@ def test_evaluation_counts_the_first_episode_of_each_environment(monkeypatch):
 @pytest.fixture
 def matrix_game(monkeypatch):
     """Makes the task "matrix" known: episodes of three steps, so that runs are fast."""
-    monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, {}))
+    monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, {}, {}))
 
 
 class Recorder:
@@ -574,8 +574,8 @@ def smoke(folder, monkeypatch, script, env_id, **options):
 
     Returns the arguments of the first call of td_loss. Episodes are cut after 20 steps.
     """
-    domain, keywords = envs._TASKS[env_id]
-    monkeypatch.setitem(envs._TASKS, env_id, (domain, {**keywords, "horizon": 20}))
+    domain, keywords, defaults = envs._TASKS[env_id]
+    monkeypatch.setitem(envs._TASKS, env_id, (domain, {**keywords, "horizon": 20}, defaults))
     losses = Spy(monkeypatch, script, "td_loss")
     short = dict(num_envs=5, total_timesteps=200, learning_starts=80, train_frequency=20, eval_frequency=100)
     args = args_for(script, env_id, runs_dir=str(folder), **{**TINY, **short, **options})
@@ -601,12 +601,12 @@ def test_same_seed_same_curve_and_seed_zero_counts(tmp_path, matrix_game):
     """A seed changes what is played and what is learned."""
     curves = []
     for run, seed in enumerate((0, 0, 1)):
-        short = {**TINY, "total_timesteps": 520, "learning_starts": 100, "train_frequency": 4, "batch_size": 2}
+        short = {**TINY, "total_timesteps": 1_020, "learning_starts": 100, "train_frequency": 4, "batch_size": 2}
         args = Args(env="matrix", seed=seed, runs_dir=f"{tmp_path}/{run}", **short)
         curves.append(scalars(avf_qplex.train(args)))
     assert curves[0] == curves[1]
-    tags = {"charts/episodic_return", "losses/td_loss", "losses/q_values", "losses/grad_norm"}
-    rest = {"charts/epsilon", "eval/return", "eval/discounted_return", "eval/length", "eval/success"}
+    tags = {"charts/episodic_return", "losses/td_loss", "losses/q_values"}
+    rest = {"eval/return", "eval/discounted_return", "eval/length", "eval/success"}
     assert curves[0].keys() == tags | rest
     for tag in tags:
         assert curves[0][tag] != curves[2][tag], tag
@@ -616,10 +616,7 @@ def test_epsilon_falls(tmp_path, monkeypatch, matrix_game):
     acted = Spy(monkeypatch, avf_qplex, "act")
     options = dict(total_timesteps=8_000, learning_starts=2_000, exploration_timesteps=4_000, end_e=0.05)
     options |= dict(num_envs=20, eval_frequency=2_000, train_frequency=10_000)
-    folder = avf_qplex.train(Args(env="matrix", runs_dir=str(tmp_path), **{**TINY, **options}))
-    logged = scalars(folder)["charts/epsilon"]
-    assert [step for step, _ in logged] == [2_000, 4_000, 6_000, 8_000]
-    assert [round(value, 2) for _, value in logged] == [1.0, 0.53, 0.05, 0.05]
+    avf_qplex.train(Args(env="matrix", runs_dir=str(tmp_path), **{**TINY, **options}))
     epsilon = [call.epsilon for call in acted.calls if call.rng is not None]
     assert set(epsilon[:101]) == {1.0} and epsilon[200] == pytest.approx(0.525) and epsilon[-1] == 0.05
     assert all(call.epsilon == 0 for call in acted.calls if call.rng is None), "evaluation is greedy"

@@ -1,5 +1,6 @@
 """The step contract, for every task."""
 
+import json
 import warnings
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 import envs
 from envs import checks
-from tests.matrix_game import MatrixGame
+from tests.matrix_game import MatrixGame, WaitingGame
 
 every_task = pytest.mark.parametrize("env_id", envs.IDS)
 
@@ -138,7 +139,9 @@ def test_single_view_is_the_batch_of_one(env_id):
     single_obs, info = single.reset(seed=7)
     for _ in range(batch.horizon):
         np.testing.assert_array_equal(obs[0], single_obs)
-        assert_same({key: value[0] for key, value in infos.items()}, info)
+        assert info.keys() == infos.keys() and type(info["success"]) is bool
+        for name, value in infos.items():
+            np.testing.assert_array_equal(value[0], info[name])
         actions = rng.integers(0, batch.n_actions, (1, batch.n_agents))
         obs, rewards, terminations, truncations, infos = batch.step(actions)
         single_obs, reward, terminated, truncated, info = single.step(actions[0])
@@ -170,22 +173,156 @@ def test_saved_state_continues_exactly(env_id):
 
     expected = go_on(env)
     obs, infos = other.load_state(saved)
-    np.testing.assert_array_equal(obs, saved["_obs"])
-    np.testing.assert_array_equal(infos["macro_done"], saved["macro_done"])
+    assert obs.tobytes() == saved["_obs"] and infos["macro_done"].tobytes() == saved["macro_done"]
     assert_same(expected, go_on(other))
     with pytest.raises(ValueError, match="another environment"):
         envs.make(env_id, 5).load_state(saved)
+    for missing in ("elapsed", "np_random"):
+        with pytest.raises(ValueError, match=missing):
+            other.load_state({name: value for name, value in saved.items() if name != missing})
+
+
+@every_task
+def test_infos_of_one_environment_can_be_written_down(env_id):
+    """A number is a Python number, so Gymnasium's own batches make an array of bools of `success`."""
+    env = gym.make(f"{env_id}-v0")
+    _, info = env.reset(seed=0)
+    for _ in range(3):
+        assert type(info["success"]) is bool
+        assert json.loads(json.dumps(info, default=np.ndarray.tolist)).keys() == info.keys()
+        _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
+    batch = gym.make_vec(f"{env_id}-v0", 2, vectorization_mode="sync")
+    _, infos = batch.reset(seed=0)
+    assert infos["success"].dtype == bool and not infos["success"].any()
+
+
+def test_a_saved_state_without_the_generator_is_refused():
+    env = envs.make("ct-10", 2)
+    env.reset(seed=0)
+    saved = env.save_state()
+    saved.pop("np_random")
+    with pytest.raises(ValueError, match="the saved state has no 'np_random'"):
+        env.load_state(saved)
+
+
+def test_a_reset_takes_its_option_and_no_other():
+    batch = envs.make("bp-10", 2)
+    for env in (batch, gym.make("bp-10-v0").unwrapped):
+        env.reset(seed=0, options={})
+        with pytest.raises(ValueError, match=r"the only option of a reset is 'reset_mask', got \['mask'\]"):
+            env.reset(options={"mask": np.array([True])})
+    single = gym.make("bp-10-v0").unwrapped
+    single.reset(seed=0)
+    single.step((7, 7))
+    single.reset(options={"reset_mask": np.array([False])})
+    assert single.vector_env.elapsed.tolist() == [1]
+    single.reset()
+    assert single.vector_env.elapsed.tolist() == [0]
+
+
+# ---- what a domain returns ------------------------------------------------------------------------------------------
+def spoil(monkeypatch, method, change):
+    """A started batch of three waiting games in which a method's result is changed from the second step on."""
+    env = WaitingGame(3, joins=0)
+    real = getattr(WaitingGame, method)
+
+    def spoiled(self, **arguments):
+        result = real(self, **arguments)
+        return change(result) if self.elapsed[0] == 2 else result
+
+    monkeypatch.setattr(WaitingGame, method, spoiled)
+    env.reset(seed=0)
+    env.step(np.zeros((3, 2), int))
+    return env
+
+
+def at(index, value):
+    """A function that gives a copy of an array with another value at the index."""
+
+    def change(array):
+        array = array.copy()
+        array[index] = value
+        return array
+
+    return change
+
+
+def part(number, change):
+    """A function that changes one of the arrays that `_advance` returns."""
+    return lambda arrays: tuple(change(array) if i == number else array for i, array in enumerate(arrays))
+
+
+@pytest.mark.parametrize(
+    ("method", "change", "line"),
+    [
+        ("_observe", at((1, 0, 0), np.nan), "_observe must be finite, got nan for agent 0 of environment 1 at step 2"),
+        ("_observe", at((2, 1, 0), np.inf), "_observe must be finite, got inf for agent 1 of environment 2 at step 2"),
+        ("_observe", lambda obs: obs[:, :1], "_observe must be float32 (3, 2, 1), got float32 (3, 1, 1)"),
+        ("_observe", np.float64, "_observe must be float32 (3, 2, 1), got float64 (3, 2, 1)"),
+        ("_state", at((0, 0), -np.inf), "_state must be finite, got -inf for environment 0 at step 2"),
+        ("_state", lambda state: state[:, 0], "_state must be float32 (3, 1), got float32 (3,)"),
+        ("_state", lambda state: state.tolist(), "_state must be float32 (3, 1), got list"),
+        ("_advance", part(0, at(2, np.nan)), "_advance: rewards must be finite, got nan for environment 2 at step 2"),
+        ("_advance", part(0, np.float32), "_advance: rewards must be float64 (3,), got float32 (3,)"),
+        ("_advance", part(0, np.sum), "_advance: rewards must be float64 (3,), got float64"),
+        ("_advance", part(1, np.int64), "_advance: terminations must be bool (3,), got int64 (3,)"),
+        ("_advance", part(2, lambda x: x[:, 0]), "_advance: ended must be bool (3, 2), got bool (3,)"),
+        ("_advance", part(3, lambda x: False), "_advance: success must be bool (3,), got bool"),
+        ("_can_start", lambda x: x[0], "_can_start must be bool (3, 2, 2), got bool (2, 2)"),
+        ("_can_start", np.int64, "_can_start must be bool (3, 2, 2), got int64 (3, 2, 2)"),
+    ],
+)
+def test_what_a_domain_returns_is_checked(monkeypatch, method, change, line):
+    env = spoil(monkeypatch, method, change)
+    with pytest.raises(ValueError) as error:
+        env.step(np.zeros((3, 2), int))
+    assert str(error.value) == f"WaitingGame.{line}"
+
+
+@pytest.mark.parametrize("method", ["_observe", "_state"])
+def test_a_reset_is_checked_too(monkeypatch, method):
+    env = WaitingGame(3, joins=0)
+    real = getattr(WaitingGame, method)
+    monkeypatch.setattr(WaitingGame, method, lambda self, **start: real(self, **start) * np.float32(np.nan))
+    with pytest.raises(
+        ValueError, match=rf"WaitingGame\.{method} must be finite, got nan for .*environment 0 at step 0"
+    ):
+        env.reset(seed=0)
+
+
+class Restless(MatrixGame):
+    """In environment 0 somebody ends the game in the second step."""
+
+    def _advance(self):
+        self.cut[0] = self.elapsed[0] == 2
+        return super()._advance()
+
+
+def test_a_domain_may_cut_an_episode():
+    env = Restless(2)
+    env.reset(seed=0)
+    ends = []
+    for _ in range(3):
+        _, _, terminations, truncations, infos = env.step(np.zeros((2, 2), int))
+        ends.append((terminations.tolist(), truncations.tolist()))
+        over = terminations | truncations
+        if over.any():
+            assert infos["macro_done"][over].all()
+            env.reset(options={"reset_mask": over})
+    running = [False, False]
+    assert ends == [(running, running), (running, [True, False]), ([False, True], running)]
 
 
 def test_reset_mask_touches_only_its_environments():
     env = envs.make("ct-10", 3)
     play(env, 5, seed=0)
-    before = env.save_state()
+    names = ("position", "target", "elapsed", "episode_return", "_obs")
+    before = {name: getattr(env, name).copy() for name in names}
     env.reset(options={"reset_mask": np.array([False, True, False])})
-    after = env.save_state()
-    for name in ("position", "target", "elapsed", "episode_return", "_obs"):
-        np.testing.assert_array_equal(before[name][[0, 2]], after[name][[0, 2]])
-    assert after["elapsed"].tolist() == [5, 0, 5]
+    for name in names:
+        np.testing.assert_array_equal(before[name][[0, 2]], getattr(env, name)[[0, 2]])
+    assert env.elapsed.tolist() == [5, 0, 5]
 
 
 def test_a_registered_task_is_known_everywhere(monkeypatch):
@@ -196,10 +333,11 @@ def test_a_registered_task_is_known_everywhere(monkeypatch):
     assert envs.make("matrix", num_envs=3).tell and not envs.make("matrix", tell=False).tell
     assert gym.make("matrix-v0").reset(seed=0)[0].shape == (2, 9)
     assert envs.make("tests.matrix_game:matrix", 2).num_envs == 2
-    with pytest.raises(ValueError, match="there is an environment 'matrix' already"):
-        envs.register("matrix", MatrixGame)
-    with pytest.raises(gym.error.Error, match="Malformed"):
-        envs.register("a b", MatrixGame)
+    with pytest.raises(ValueError, match=r"there is an environment .* already, of tests\.matrix_game:MatrixGame"):
+        envs.register("matrix", WaitingGame)
+    for env_id in ("a b", "", "-", "a-", "a:b", "a/b", "a\n", None):
+        with pytest.raises(ValueError, match="an id must be of letters, digits and '_'"):
+            envs.register(env_id, MatrixGame)
     assert envs.problem("a b") == f"unknown environment 'a b'; valid ids: {' '.join(envs.IDS)} matrix"
     with pytest.raises(ImportError, match="No module named 'nowhere'"):
         envs.make("nowhere:matrix")
@@ -242,11 +380,11 @@ def test_bad_input_says_what_is_wrong():
 NAN = float("nan")
 BAD_KEYWORDS = {
     "bp-10": {
-        "num_envs": [0, 2.5, NAN, "2", [2], None],
+        "num_envs": [0, 2.5, NAN, "2", [2], None, 2e15, 10**20],
         "grid": [4, 7, 10.5, NAN, "10", True, None],
         "primitive": ["False", 1, None],
-        "horizon": [0, 7.5, NAN, float("inf")],
-        "render_mode": ["human"],
+        "horizon": [0, 7.5, NAN, float("inf"), 1e300],
+        "render_mode": ["human", "rgb_array_list", ["rgb_array"], np.array(["rgb_array", "human"]), True],
         "penalty": [NAN, float("-inf"), "-10", [-10.0], True, None],
         "step_cost": [NAN, np.array([-0.1, -0.1])],
         "small_reward": [NAN, 1j],
@@ -372,6 +510,19 @@ def test_pushing_rules():
     env, rewards, infos = push((1.5, 4.5), 0, steps=4)
     assert rewards == [-0.1, -0.1, -0.1, 9.9] and infos["macro_done"].all(), "small box 0 reaches the goal row"
     assert env.box_y[0].tolist() == [9.5, 5.5, 5.5] and not infos["success"][0]
+
+
+def test_agent_1_goes_after_agent_0_has_pushed_and_not_the_other_way_round():
+    """One pushes small box 0 out of row 5.5. The other wants to go south through that row, where a cell is blocked."""
+    below_the_box, above_the_row = (1.5, 4.5), (4.5, 6.5)
+    for pusher, faces, place in ((0, 2, [4.5, 5.5]), (1, 1, [4.5, 6.5])):
+        starts = [below_the_box, above_the_row] if pusher == 0 else [above_the_row, below_the_box]
+        orientations = (0, 2) if pusher == 0 else (2, 0)
+        env = envs.make("bp-10", agent_starts=starts, agent_orientations=orientations)
+        env.reset(seed=0)
+        env.step(np.array([[4, 2]]) if pusher == 0 else np.array([[2, 4]]))
+        assert env.box_y[0, 0] == 6.5
+        assert env.position[0, 1 - pusher].tolist() == place and env.orientation[0, 1 - pusher] == faces
 
 
 def test_both_may_push_one_small_box_beyond_the_goal_row():

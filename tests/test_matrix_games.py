@@ -44,7 +44,7 @@ def play(monkeypatch, tmp_path):
 
     def play(script, game, **options):
         payoff, updates, learning_rate = SETTINGS[game]
-        monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, dict(payoff=payoff, tell=True)))
+        monkeypatch.setitem(envs._TASKS, "matrix", (MatrixGame, dict(payoff=payoff, tell=True), {}))
         settings = dict(
             learning_rate=learning_rate,
             anneal_lr=False,
@@ -197,7 +197,7 @@ def test_optimism_below_the_bound_pushes_and_above_it_leaves(script, monkeypatch
     game = dict(joins=0.1, big=10.0, fails=3.0, safe=2.0)
     gamma = 0.9
     assert optimism.bound(*game.values(), gamma) == pytest.approx(0.527, abs=1e-3)
-    monkeypatch.setitem(envs._TASKS, "waiting", (WaitingGame, game))
+    monkeypatch.setitem(envs._TASKS, "waiting", (WaitingGame, game, {}))
     td_loss = script.td_loss
     found = {}
 

@@ -14,7 +14,7 @@ from tests.test_runs import assert_same_run, interrupted, resume
 def test_a_run_that_is_resumed_equals_one_that_is_not(tmp_path, monkeypatch):
     """Interrupted in the middle of episodes. The same curves and weights come out."""
     task = dict(make=Corridor, options=OPTIONS, horizon=20)
-    monkeypatch.setitem(envs._TASKS, "corridor", (OptionsEnv, task))
+    monkeypatch.setitem(envs._TASKS, "corridor", (OptionsEnv, task, {}))
     undisturbed = avf_vdn.train(short(avf_vdn, "corridor", tmp_path / "one"))
     args = short(avf_vdn, "corridor", tmp_path / "other", checkpoint_frequency=0.0)
     folder = interrupted(monkeypatch, avf_vdn, args, 177)

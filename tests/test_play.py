@@ -2,8 +2,9 @@
 
 import dataclasses
 import importlib
-import json
+import os
 import re
+import resource
 import subprocess
 import sys
 from itertools import combinations, pairwise
@@ -59,14 +60,15 @@ def played(run, episodes=2, **options):
 # ---- recording ------------------------------------------------------------------------------------------------------
 def test_the_recording_of_a_scripted_episode_is_the_one_done_by_hand():
     recorder = scripted()
-    episode, pictures = recorder.episode(), recorder.frames
+    episode = recorder.episode()
+    pictures = [frame.convert("RGB").tobytes() for frame in recorder.frames]
     assert episode.bars(0) == [(0, 1, 7), (1, 2, 7), (2, 6, 0), (6, 7, 5), (7, 8, 7)]
     assert episode.bars(1) == [(0, 4, 1), (4, 5, 6), (5, 6, 6), (6, 7, 7), (7, 8, 7)]
     assert episode.rows() == [0, 1, 2, 4, 5, 6, 7]
     assert episode.running[3].tolist() == [0, 1] and episode.running[5].tolist() == [0, 6]
     np.testing.assert_allclose(episode.rewards, np.full(8, -0.1))
     assert episode.labels == [0, 1] and episode.names[0][7] == "Stay"
-    assert len(pictures) == 9 and all((one != other).any() for one, other in combinations(pictures, 2))
+    assert len(pictures) == 9 and all(one != other for one, other in combinations(pictures, 2))
     # of environment 0, of the network's run before each step
     assert episode.utilities.shape == (8, 2, 8) and episode.utilities[5, 1].tolist() == (np.arange(16, 24) + 5).tolist()
 
@@ -226,6 +228,15 @@ def test_rows_fit_a_terminal(env_id):
     assert max(map(len, lines)) <= 120 and not any(line.endswith("...") for line in lines)
 
 
+def test_rows_of_odd_names_fit_a_terminal():
+    script = importlib.import_module("avf_qplex")
+    recorder = scripted()
+    recorder.env.macro_action_names = [["", "-1", "A--B", "Wait-", "去工作室", "x" * 200, "-", "Stay"]] * 2
+    lines = play.describe_rows(script, script.Args(env="bp-10"), recorder, 0, 3)
+    assert max(map(len, lines)) == 120
+    assert [line.split("|")[1].split()[:2] for line in lines[5:7]] == [["0", "Stay"], ["1", "-1"]]
+
+
 # ---- the command line -----------------------------------------------------------------------------------------------
 def test_what_is_printed(run, brief, capsys, monkeypatch):
     script, asked = importlib.import_module("avf_qplex"), []
@@ -305,7 +316,8 @@ def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--episodes=0"], "--episodes must be at least 1, got 0"),
+        (["--episodes=0"], "--episodes must be from 1 to 100000, got 0"),
+        (["--episodes=100001"], "--episodes must be from 1 to 100000, got 100001"),
         (["--episodes=many"], "argument --episodes: invalid int value: 'many'"),
         (["--seed=-1"], "--seed must not be negative, got -1"),
         (["--model=worst"], "invalid choice: 'worst'"),
@@ -337,7 +349,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     path.write_text("kept")
 
     def broken(file):
-        file.write_bytes(b"half")
+        file.write(b"half")
         raise OSError("disk full")
 
     with pytest.raises(SystemExit, match=r"^play: cannot write .*team.png: disk full"):
@@ -350,38 +362,304 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
         play.write(str(path), too_large)
     (tmp_path / "folder.png").mkdir()
     with pytest.raises(SystemExit, match=r"^play: cannot write .*folder.png: "):
-        play.write(str(tmp_path / "folder.png"), lambda file: file.write_bytes(b"whole"))
+        play.write(str(tmp_path / "folder.png"), lambda file: file.write(b"whole"))
     assert sorted(file.name for file in tmp_path.iterdir()) == ["folder.png", "team.png"]
     assert path.read_text() == "kept"
 
 
-def test_folders_that_are_no_runs_end_with_one_line(run, tmp_path):
-    def refused(folder, message):
+# ---- what is not to be trusted --------------------------------------------------------------------------------------
+@pytest.fixture
+def refused(tmp_path):
+    """Checks that play ends with one line, a regular expression, for a folder."""
+
+    def check(message, folder=tmp_path, **options):
         with pytest.raises(SystemExit, match=f"^play: .*{message}") as error:
-            play.load_run(folder, "best")
-        assert "\n" not in str(error.value)
+            play.load_run(folder, "best", **options)
+        assert "\n" not in str(error.value) and "weights_only" not in str(error.value)
 
-    def settings(**changes):
-        (tmp_path / "args.json").write_text(json.dumps({**json.loads((run / "args.json").read_text()), **changes}))
-        return tmp_path
+    return check
 
-    def model(**changes):
+
+@pytest.fixture
+def edit(run, tmp_path):
+    """Writes the run's model with other content and other settings into tmp_path."""
+
+    def write(settings=None, **content):
         saved = torch.load(run / "best.pt", weights_only=True)
-        torch.save(saved | {"args": saved["args"] | changes}, tmp_path / "best.pt")
-        return settings()
+        torch.save({**saved, "args": {**saved["args"], **(settings or {})}, **content}, tmp_path / "best.pt")
 
-    refused(tmp_path / "missing", "there is no folder .*missing")
-    refused(run / "args.json", "there is no folder")
-    refused(tmp_path, "is not a run folder: args.json: ")
-    (tmp_path / "args.json").write_text("[1, 2]")
-    refused(tmp_path, "is not a run folder: args.json: ")
-    refused(settings(algorithm="os"), "is a run of 'os', which is none of avf_vdn avf_qmix")
-    refused(settings(), "best.pt")
-    (tmp_path / "best.pt").write_bytes(b"half")
-    refused(settings(), "best.pt")
-    refused(model(env="nowhere"), "nowhere")
-    refused(model(env="bp-10"), "best.pt does not fit its settings: ")
-    refused(model(hidden_size=32), "best.pt does not fit its settings: ")
-    assert play.load_run(model(device="cuda"), "best")[1].device == "cpu"
-    with pytest.raises(SystemExit, match=r"^play: .*last\.pt"):
+    return write
+
+
+def test_folders_that_are_no_runs_end_with_one_line(run, tmp_path, refused):
+    refused("there is no model .*missing/best.pt", tmp_path / "missing")
+    refused("there is no model .*args.json/best.pt", run / "args.json")
+    refused("there is no model .*best.pt")
+    (tmp_path / "best.pt").mkdir()
+    refused("there is no model .*best.pt")
+    with pytest.raises(SystemExit, match=r"^play: there is no model .*last\.pt"):
         play.load_run(tmp_path, "last")
+
+
+def test_a_pipe_in_place_of_a_model_is_not_waited_for(tmp_path, refused):
+    os.mkfifo(tmp_path / "best.pt")
+    refused("there is no model .*best.pt")
+
+
+def test_damaged_models_end_with_one_line(run, tmp_path, refused):
+    path, whole = tmp_path / "best.pt", (run / "best.pt").read_bytes()
+    model = torch.load(run / "best.pt", weights_only=True)
+    message = "best.pt is damaged, or not the model of a script"
+    for content in (b"", b"half", whole[:-1], whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        refused(message)
+    weights = model["networks"]["agents.encoder.weight"].numpy().tobytes()
+    flipped = bytearray(whole)
+    flipped[whole.index(weights)] ^= 1
+    path.write_bytes(flipped)
+    refused(message)
+    for content in ([1, 2], {}, {**model, "args": [1, 2]}, {**model, "networks": Path()}):
+        torch.save(content, path)
+        refused(message)
+    torch.save(model, path, _use_new_zipfile_serialization=False)  # without checksums
+    refused(message)
+
+
+def test_a_model_file_runs_no_code_and_the_line_does_not_advise_to_let_it(tmp_path, refused, capfd):
+    class Payload:
+        def __reduce__(self):
+            return print, ("it runs",)
+
+    torch.save({"algorithm": Payload()}, tmp_path / "best.pt")
+    refused("best.pt is damaged, or not the model of a script$")
+    assert not capfd.readouterr().out
+
+
+def test_a_module_that_a_model_names_is_imported_only_if_it_is_given(edit, tmp_path, refused, monkeypatch):
+    package = tmp_path / "runs" / "evil"
+    package.mkdir(parents=True)
+    for name in ("__init__", "payload"):
+        (package / f"{name}.py").write_text(f"from pathlib import Path\nPath({str(package / 'ran')!r}).touch()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    edit({"env": "runs.evil.payload:wtd-s"})
+    message = r"names a module, which is imported only if you add --env 'runs\.evil\.payload:wtd-s'"
+    refused(message)
+    with pytest.raises(SystemExit, match=message):
+        play.main([str(tmp_path)])
+    refused("is of the task 'runs.evil.payload:wtd-s', not of 'wtd-s'", env="wtd-s")
+    refused("is of the task 'runs.evil.payload:wtd-s', not of 'runs.evil:wtd-s'", env="runs.evil:wtd-s")
+    refused("is of the task 'runs.evil.payload:wtd-s', not of ''", env="")
+    assert not (package / "ran").exists()
+    edit({"env": ["runs.evil.payload:wtd-s"]})
+    refused("names a module")
+    edit({"env": "runs.evil.payload:wtd-s"}, algorithm="runs.evil.payload")
+    refused("is of 'runs.evil.payload', which is none of avf_vdn avf_qmix")
+    assert not (package / "ran").exists()
+    edit({"env": "runs.evil.payload:wtd-s"})
+    assert play.load_run(tmp_path, "best", env="runs.evil.payload:wtd-s")[1].env == "runs.evil.payload:wtd-s"
+    assert (package / "ran").exists()
+
+
+def test_the_task_may_be_given_though_it_need_not(run, refused):
+    assert play.load_run(run, "best", env="wtd-s")[1].env == "wtd-s"
+    refused("best.pt is of the task 'wtd-s', not of 'wtd-d'", run, env="wtd-d")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"env": "nowhere"}, "does not fit its settings: .*unknown environment 'nowhere'"),
+        ({"env": None}, "does not fit its settings: .*unknown environment"),
+        ({"env": "bp-10"}, "does not fit its settings: .*size mismatch"),
+        ({"hidden_size": 32}, "does not fit its settings: .*size mismatch"),
+        ({"hidden_size": 10**14}, "does not fit its settings: "),
+        ({"hidden_size": "16"}, "does not fit its settings: "),
+        ({"hidden_size": 16.5}, "does not fit its settings: "),
+        ({"gamma": 1.5}, "does not fit its settings: .*--gamma must be from 0 to 1, got 1.5"),
+        ({"gamma": float("nan")}, "does not fit its settings: .*--gamma must be"),
+        ({"gamma": None}, "does not fit its settings: "),
+        ({"depth": 3}, "is of another version of avf_qplex.py: .'depth'. differ$"),
+        ({"\n": 3, "b": 4}, r"is of another version of avf_qplex.py: .'.n', 'b'. differ$"),
+        ({3: 3}, "is of another version of avf_qplex.py: .'3'. differ$"),
+    ],
+)
+def test_edited_settings_end_with_one_line(edit, refused, settings, message):
+    edit(settings)
+    refused(message)
+
+
+def test_a_missing_setting_is_not_replaced_by_todays_default(run, tmp_path, refused):
+    saved = torch.load(run / "best.pt", weights_only=True)
+    for name in saved["args"]:
+        others = {other: value for other, value in saved["args"].items() if other != name}
+        torch.save({**saved, "args": others}, tmp_path / "best.pt")
+        refused(f"is of another version of avf_qplex.py: .'{name}'. differ$")
+
+
+def without(key, values):
+    return {name: value for name, value in values.items() if name != key}
+
+
+WEIGHT = "agents.encoder.weight"
+EDITS = {  # of a model's networks
+    "none": lambda networks: None,
+    "a list": list,
+    "a weight less": lambda networks: without(WEIGHT, networks),
+    "a weight more": lambda networks: {**networks, "other": torch.zeros(3)},
+    "a number for a weight": lambda networks: {**networks, WEIGHT: 3.0},
+    "another shape": lambda networks: {**networks, WEIGHT: networks[WEIGHT][:, 1:]},
+    "a number as a name": lambda networks: {**networks, 3: networks[WEIGHT]},
+}
+
+
+@pytest.mark.parametrize("change", EDITS)
+def test_edited_networks_end_with_one_line(run, edit, refused, change):
+    networks = torch.load(run / "best.pt", weights_only=True)["networks"]
+    edit(networks=EDITS[change](networks))
+    refused("best.pt does not fit its settings: ")
+
+
+def test_a_model_that_lacks_a_part_ends_with_one_line(run, tmp_path, refused):
+    saved = torch.load(run / "best.pt", weights_only=True)
+    for key in ("algorithm", "args", "networks", "step"):
+        torch.save(without(key, saved), tmp_path / "best.pt")
+        refused("best.pt is damaged, or not the model of a script")
+
+
+@pytest.mark.parametrize("value", [None, [], "text", -1, 2.5, 10**30, float("inf"), {"a": 1}])
+def test_whatever_a_setting_is_there_is_a_line_or_it_plays(run, edit, tmp_path, brief, capsys, value):
+    """Few settings matter to a model that is watched. No value of any of them gives a traceback."""
+    refused = set()
+    for name in torch.load(run / "best.pt", weights_only=True)["args"]:
+        edit({name: value})
+        capsys.readouterr()
+        try:
+            play.main([str(tmp_path), "--episodes=1", "--rows=0-0"])
+            assert "greedy episodes" in capsys.readouterr().out
+        except SystemExit as error:
+            refused.add(name)
+            assert re.fullmatch("play: .*best.pt .*|play: wtd-s cannot be played: .*", str(error))
+    assert {"env", "hidden_size"} <= refused
+
+
+def test_weights_that_are_not_finite_and_doubles_play(run, edit, tmp_path, brief, capsys):
+    networks = torch.load(run / "best.pt", weights_only=True)["networks"]
+    for change in (lambda weight: weight * torch.nan, torch.Tensor.double):
+        edit(networks={name: change(weight) for name, weight in networks.items()})
+        play.main([str(tmp_path), "--episodes=1", f"--timeline={tmp_path / 'team.svg'}", "--steps=0-12"])
+        assert "greedy episodes" in capsys.readouterr().out
+
+
+def test_a_model_of_another_device_plays_on_the_cpu(edit, tmp_path):
+    edit({"device": "cuda"})
+    assert play.load_run(tmp_path, "best")[1].device == "cpu"
+
+
+# ---- tasks of one's own, and disks ----------------------------------------------------------------------------------
+def nothing(env, index):
+    raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    "draws",
+    [
+        nothing,
+        lambda env, index: None,
+        lambda env, index: np.zeros((4, 4), np.uint8),
+        lambda env, index: np.zeros((4, 4, 4), np.uint8),
+        lambda env, index: np.zeros((4, 4, 3)),
+        lambda env, index: np.zeros((0, 4, 3), np.uint8),
+        lambda env, index: [[[0, 0, 0]]],
+    ],
+)
+def test_a_task_that_draws_nothing_has_no_gif(run, tmp_path, brief, monkeypatch, draws):
+    monkeypatch.setattr(envs.warehouse.Warehouse, "_draw", draws)
+    with pytest.raises(SystemExit, match=r"^play: --gif: _draw of this task does not give a picture"):
+        play.main([str(run), "--episodes=1", f"--gif={tmp_path / 'team.gif'}"])
+    assert not list(tmp_path.iterdir())
+    play.main([str(run), "--episodes=1"])
+
+
+def test_pictures_that_no_gif_can_hold_end_with_one_line(run, tmp_path, brief, monkeypatch):
+    def refused(draws, message):
+        monkeypatch.setattr(envs.warehouse.Warehouse, "_draw", draws)
+        with pytest.raises(SystemExit, match=f"^play: {message}") as error:
+            play.main([str(run), "--episodes=1", f"--gif={tmp_path / 'team.gif'}"])
+        assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+
+    refused(
+        lambda env, index: np.zeros((4, 4 + env.elapsed[index], 3), np.uint8), "--gif: the pictures of this task ha"
+    )
+    refused(lambda env, index: np.full((1, 70_000, 3), env.elapsed[index], np.uint8), "cannot write .*team.gif: .+")
+
+
+def test_a_task_that_raises_ends_with_its_name(run, brief, monkeypatch):
+    def broken(self):
+        raise KeyError("marbles")
+
+    monkeypatch.setattr(envs.warehouse.Warehouse, "_advance", broken)
+    with pytest.raises(SystemExit, match=r"^play: wtd-s cannot be played: KeyError: 'marbles'$"):
+        play.main([str(run), "--episodes=1"])
+
+
+def test_a_long_animation_is_cut_and_play_says_so(run, tmp_path, brief, capsys, monkeypatch):
+    gif = tmp_path / "team.gif"
+    monkeypatch.setattr(play, "MOST_FRAMES", 13)
+    play.main([str(run), "--episodes=1", f"--gif={gif}"])
+    assert "ends" not in capsys.readouterr().out
+    monkeypatch.setattr(play, "MOST_FRAMES", 5)
+    play.main([str(run), "--episodes=1", f"--gif={gif}"])
+    assert f"{gif} ends at time 4 of 12, since a longer one would be too large" in capsys.readouterr().out
+    with Image.open(gif) as animation:
+        assert animation.n_frames == 5
+
+
+def test_a_timeline_that_is_too_long_needs_steps(run, tmp_path, brief, monkeypatch):
+    monkeypatch.setattr(play, "MOST_STEPS", 11)
+    command = [str(run), "--episodes=1", f"--timeline={tmp_path / 'team.svg'}"]
+    with pytest.raises(SystemExit, match=r"^play: --timeline can show 11 steps, the episode has 12: choose some with"):
+        play.main(command)
+    assert not list(tmp_path.iterdir())
+    play.main([*command, "--steps=1-12"])
+
+
+@pytest.mark.parametrize("name", ["team.gif", "team.png", "team.svg", "team.pdf"])
+def test_a_full_disk_ends_with_one_line_and_leaves_nothing(run, tmp_path, brief, name):
+    """Here files may have 1,000 bytes at most."""
+    path = tmp_path / name
+    path.write_text("kept")
+    option = "--gif" if name == "team.gif" else "--timeline"
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, most))
+    try:
+        with pytest.raises(SystemExit, match=f"^play: cannot write .*{name}: .*File too large") as error:
+            play.main([str(run), "--episodes=1", f"{option}={path}"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+    assert "\n" not in str(error.value)
+    assert [file.name for file in tmp_path.iterdir()] == [name] and path.read_text() == "kept"
+
+
+def test_a_name_that_is_too_long_for_a_file_and_a_pipe_in_the_way(tmp_path):
+    with pytest.raises(SystemExit, match=r"^play: cannot write .*File name too long"):
+        play.write(str(tmp_path / f"{'x' * 249}.gif"), lambda file: file.write(b"whole"))
+    os.mkfifo(tmp_path / "team.gif.new")
+    play.write(str(tmp_path / "team.gif"), lambda file: file.write(b"whole"))
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("team.gif", b"whole")]
+
+
+def test_a_folder_that_cannot_be_written_ends_with_one_line(tmp_path, monkeypatch):
+    def read_only(self, missing_ok=False):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "unlink", read_only)
+    with pytest.raises(SystemExit, match=r"^play: cannot write .*team.gif: .*Permission denied"):
+        play.write(str(tmp_path / "team.gif"), lambda file: None)
+
+
+@pytest.mark.slow
+def test_a_full_disk_behind_the_standard_output_ends_with_one_line(run):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, play.__file__, str(run), "--episodes=1"]
+        program = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert program.stderr == "play: [Errno 28] No space left on device\n" and program.returncode == 1

@@ -138,11 +138,20 @@ def test_command_line(tmp_path, capsys):
     assert len(printed) == 5 and "both push the big box" in printed[2] and "98.900" in printed[2]
 
 
+def test_what_cannot_be_written_is_told_before_anything_is_played(tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmark.scripted.reference", lambda *_: pytest.fail("played"))
+    with pytest.raises(SystemExit, match="scripted: cannot write"):
+        main(["-o", str(tmp_path / "no" / "file.json")])
+
+
 def test_bad_input_is_one_line(tmp_path):
     for flags, message in (
-        (["--episodes", "1"], "--episodes must be at least 2"),
+        (["--episodes", "1"], "--episodes must be from 2 to 100,000"),
+        (["--episodes", "100001"], "--episodes must be from 2 to 100,000"),
         (["--envs", "bp-11"], "argument --envs: invalid choice: 'bp-11'"),
         (["--envs", "bp-10", "--episodes", "2", "-o", str(tmp_path / "no" / "file.json")], "cannot write"),
+        (["--envs", "bp-10", "--episodes", "2", "-o", str(tmp_path)], "cannot write"),
+        (["--envs", "bp-10", "--episodes", "2", "-o", ""], "cannot write"),
     ):
         with pytest.raises(SystemExit) as error:
             main(flags)

@@ -106,10 +106,15 @@ def test_updates_are_counted_as_the_script_makes_them(tmp_path, monkeypatch):
     assert found[0] == 0 and found[1] in (4, 5) and seconds["update"] == 2.0
 
 
-def test_a_run_without_an_update_is_refused(tmp_path):
+def test_a_run_without_an_update_is_refused(tmp_path, monkeypatch):
     args = avf_qplex.parse_args(["--env=bp-10", "--train-frequency=1000000"])
     with pytest.raises(SystemExit, match=r"^speed: avf_qplex makes no update in 100 steps on bp-10"):
         speed.training([tmp_path], "avf_qplex", args, 100, 1)
+    # before anything is measured, even if it is the last of many
+    monkeypatch.setattr(speed, "play", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr(speed, "training", lambda *_: pytest.fail("measured"))
+    with pytest.raises(SystemExit, match=r"^speed: avf_qplex makes no update in 10 steps on wtd-s"):
+        speed.main(["--scripts", "mac_iaicc", "avf_qplex", "--envs", "wtd-s", "wtd-t", "--steps", "10"])
 
 
 @pytest.mark.parametrize("env_id", envs.IDS)
@@ -210,11 +215,13 @@ def test_a_measure_times_the_script(monkeypatch):
 
 def test_bad_input_is_one_line(tmp_path):
     for flags, message in (
-        (["--rounds", "0"], "--num-envs, --steps and --rounds"),
+        (["--rounds", "0"], "argument --rounds: invalid count value: '0'"),
+        (["--steps", "1000001"], "argument --steps: invalid count value: '1000001'"),
         (["--scripts", "dqn"], "argument --scripts: invalid choice: 'dqn'"),
-        (["--num-envs", "0"], "--num-envs, --steps and --rounds"),
+        (["--num-envs", "0"], "argument --num-envs: invalid count value: '0'"),
         (["--scaling"], "--scaling measures sizes of its own"),  # beside the others
-        (["--against", str(tmp_path / "nowhere")], "is no folder"),
+        (["--against", str(tmp_path / "nowhere")], "there is no "),
+        (["--against", ""], "argument --against: invalid folder value: ''"),
     ):
         with pytest.raises(SystemExit) as error:
             speed.main([*TINY, *flags])

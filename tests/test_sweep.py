@@ -8,6 +8,7 @@ there until the run is finished. Like the scripts it catches no signal, but tell
 import fcntl
 import multiprocessing
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -22,6 +23,7 @@ import pytest
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
+import envs
 from benchmark import record, sweep
 
 ROOT = Path(__file__).parents[1]
@@ -125,7 +127,7 @@ def place(tmp_path, events, monkeypatch):
 @pytest.fixture(autouse=True)
 def signals():
     """A sweep in this process leaves its handlers behind, and the signals that it got."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in sweep.SIGNALS}
     yield
     sweep.stop.clear()
     for number, handler in handlers.items():
@@ -194,12 +196,18 @@ def test_finished_runs_are_skipped(place, capsys):
     "change, message",
     [
         ({"--algos": "dqn"}, "sweep: argument --algos: invalid choice: 'dqn' (choose from "),
-        ({"--envs": "wtd-x"}, "sweep: argument --envs: invalid choice: 'wtd-x' (choose from "),
+        ({"--envs": "wtd-x"}, "sweep: argument --envs: unknown environment 'wtd-x' (did you mean "),
+        ({"--envs": "no_module:wtd-s"}, "sweep: argument --envs: No module named 'no_module'"),
         ({"--seeds": "5-1"}, "sweep: argument --seeds: invalid seeds value: '5-1'"),
         ({"--seeds": "1-2-3"}, "sweep: argument --seeds: invalid seeds value: '1-2-3'"),
         ({"--seeds": "x"}, "sweep: argument --seeds: invalid seeds value: 'x'"),
         ({"--workers": "0"}, "sweep: --workers must be at least 1, got 0"),
         ({"--address": "auto"}, "sweep: --address needs --engine ray"),
+        ({"--seeds": "1-99999999999999999999"}, "sweep: argument --seeds: invalid seeds value: '1-9999"),
+        ({"--seeds": "1000000000000001"}, "sweep: argument --seeds: invalid seeds value: '1000000000000001'"),
+        ({"--runs-dir": ""}, "sweep: argument --runs-dir: invalid folder value: ''"),
+        ({"--record": ""}, "sweep: argument --record: invalid folder value: ''"),
+        ({"--runs-dir": "/proc"}, "sweep: cannot use --record or --runs-dir: "),  # a folder, but nothing can be written
         ({"--runs-dir": __file__}, "sweep: cannot use --record or --runs-dir: "),
         ({"--record": __file__}, "sweep: cannot use --record or --runs-dir: "),
         ({"--": "--seed=1"}, "sweep: --env, --seed and --runs-dir cannot stand behind --"),
@@ -240,17 +248,16 @@ def test_a_run_is_known_by_its_flags_and_code(place, capsys):
     for extra, runs in (((), 1), (("--note=a",), 2), (("--note=b",), 3), (("--note", "a"), 3), (("--crashes=0",), 3)):
         assert sweep.main(command(place, *extra)) == 0
         assert len(run_folders(place)) == runs, extra
-    (place / "counter.py").write_text(COUNTER + "# changed\n")
+    (place / "counter.py").write_text(COUNTER + "# a comment\n")
+    assert sweep.main(command(place)) == 0
+    assert len(run_folders(place)) == 3
+    (place / "counter.py").write_text(COUNTER + "changed = True\n")
     assert sweep.main(command(place)) == 0
     assert len(run_folders(place)) == 4
-    (place / "envs").mkdir()
-    (place / "envs" / "rules.py").write_text("changed = True")
-    assert sweep.main(command(place)) == 0
-    assert len(run_folders(place)) == 5
     by_hand = [sys.executable, str(place / "counter.py"), "--seed=2", f"--runs-dir={place / 'runs'}"]
     subprocess.run(by_hand, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True)
     assert sweep.main(command(place, seeds="2")) == 0
-    assert len(run_folders(place)) == 6
+    assert len(run_folders(place)) == 5
     (own,) = (place / "runs").glob("*__2__*/args.json")
     assert record.describe(own.parent)["checksum"] == "" != record.describe(run_folders(place)[-1])["checksum"]
 
@@ -258,14 +265,15 @@ def test_a_run_is_known_by_its_flags_and_code(place, capsys):
 def test_a_value_of_another_family_leaves_the_checksum(tmp_path, monkeypatch):
     """A value of Args or DEFAULTS counts on the tasks on which it is in force, anything else on all."""
     monkeypatch.setattr(record, "ROOT", tmp_path)
-    (tmp_path / "envs").mkdir()
     text = (ROOT / "avf_vdn.py").read_text()
     for edit, changes in (
         (("obs_scale=4.0", "obs_scale=3.0"), {"ct-10"}),
         (("hysteresis=0.1", "hysteresis=0.2"), {"bp-10"}),
-        (("# ---- act: one", "# ---- act, one"), {"bp-10", "wtd-s", "ct-10"}),
+        (("# ---- act: one", "# ---- act, one"), set()),
+        (("Numbered deviations", "The deviations"), set()),
+        (("step += args.num_envs", "step += args.num_envs + 0"), {"bp-10", "wtd-s", "ct-10"}),
         (("gamma: float = 0.95", "gamma: float = 0.94"), {"bp-10", "wtd-s"}),
-        (("# discount factor of", "# the discount factor of"), {"bp-10", "wtd-s", "ct-10"}),
+        (("# discount factor of", "# the discount factor of"), set()),
     ):
         found = []
         for text_now in (text, text.replace(*edit)):
@@ -281,11 +289,69 @@ def test_a_value_of_another_family_leaves_the_checksum(tmp_path, monkeypatch):
         assert {env for env in before if before[env] != after[env]} == changes, edit
 
 
+TASKS = ["bp-10", "wtd-s", "ct-10", "own:x"]
+
+
+@pytest.mark.parametrize(
+    "file, edit, changes",
+    [
+        ("envs/core.py", ("One step is one primitive time step.", "A step is a primitive time step."), set()),
+        ("envs/core.py", ("self.num_envs = num_envs", "self.num_envs = num_envs  # N"), set()),
+        ("envs/core.py", ("self.num_envs = num_envs", "self.num_envs = num_envs + 0"), {*TASKS}),
+        ("envs/capture_target.py", ("slip=0.1,", "slip=0.2,"), {"ct-10", "own:x"}),
+        ("envs/checks.py", ("np.mod(number, 1)", "np.mod(number, 2)"), {*TASKS}),
+        ("envs/rendering.py", ("import", "import sys\nimport"), set()),
+        ("envs/__init__.py", ("def make(", "def new():\n    pass\n\n\ndef make("), set()),
+        ("own.py", ("n_agents=2", "n_agents=3"), {"own:x"}),
+        ("own.py", ("import envs", "import envs  # all tasks"), set()),
+    ],
+)
+def test_the_checksum_is_of_what_a_run_executes(tmp_path, monkeypatch, file, edit, changes):
+    """Comments, docstrings, drawing and other tasks are not: modules whose files are copies, one of them edited."""
+    monkeypatch.setattr(envs, "_TASKS", dict(envs._TASKS))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own", raising=False)
+    (tmp_path / "own.py").write_text(
+        "import envs\nfrom envs.capture_target import CaptureTarget\n\n"
+        "envs._TASKS['x'] = CaptureTarget, dict(n_agents=2, key=lambda x: x)\n"
+    )
+    shutil.copytree(ROOT / "envs", tmp_path / "envs")
+    for module in [module for module in sys.modules if module.partition(".")[0] == "envs"]:
+        copy = tmp_path / "envs" / Path(sys.modules[module].__file__).name
+        monkeypatch.setattr(sys.modules[module], "__file__", str(copy))
+    before = [record.checksum("avf_vdn", task) for task in TASKS]
+    path = tmp_path / file
+    assert edit[0] in path.read_text()
+    path.write_text(path.read_text().replace(edit[0], edit[1], 1))
+    after = [record.checksum("avf_vdn", task) for task in TASKS]
+    assert {task for task, *pair in zip(TASKS, before, after, strict=True) if pair[0] != pair[1]} == changes
+
+
+def test_the_checksum_is_of_the_keywords_of_the_task(monkeypatch):
+    before = record.checksum("avf_vdn", "bp-10"), record.checksum("avf_vdn", "bp-20")
+    monkeypatch.setitem(envs._TASKS, "bp-10", (envs.BoxPushing, {"grid": 12}))
+    after = record.checksum("avf_vdn", "bp-10"), record.checksum("avf_vdn", "bp-20")
+    assert before[0] != after[0] and before[1] == after[1]
+
+
+def test_a_task_of_ones_own_is_swept_and_recorded(place, capsys, monkeypatch):
+    (place / "my_task.py").write_text(
+        "import envs\nfrom envs.capture_target import CaptureTarget\nenvs.register('own', CaptureTarget, n_agents=2)\n"
+    )
+    monkeypatch.syspath_prepend(place)
+    own = ["--record", str(place / "kept")]
+    assert sweep.main(command(place, envs=("my_task:own",), own=own)) == 0
+    assert results(capsys.readouterr().out) == ["finished"] and recorded(place)[0]["env"].tolist() == ["my_task:own"]
+    assert "my_task-own__counter__1__" in str(run_folders(place)[0])
+    assert sweep.main(command(place, envs=("my_task:own",), own=own)) == 0
+    assert results(capsys.readouterr().out) == ["recorded"]
+
+
 def test_code_that_changes_during_a_sweep_is_not_run(place, capsys, monkeypatch):
     real = sweep.run_script
 
     def run_script(*arguments):
-        (place / "counter.py").write_text(COUNTER + "# changed\n")
+        (place / "counter.py").write_text(COUNTER + "changed = True\n")
         return real(*arguments)
 
     monkeypatch.setattr(sweep, "run_script", run_script)
@@ -308,6 +374,20 @@ def test_dry_run_writes_nothing(place, capsys):
         f"counter wtd-s seed 2: resume {stopped}",
         "counter wtd-s seed 3: run",
     ]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"total_timesteps": "many"}'])
+def test_a_run_that_was_killed_while_it_began_is_begun_again(place, capsys, text):
+    """It has no checkpoint, and an args.json that is cut short."""
+    sweep.main(command(place))
+    (place / "runs").rename(place / "old")
+    (killed,) = (path for path in (place / "old").glob("*/*") if path.is_dir())
+    begun = place / "runs" / killed.parent.name / killed.name
+    begun.mkdir(parents=True)
+    (begun / "args.json").write_text(text)
+    assert sweep.main(command(place, own=["--dry-run"])) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "counter wtd-s seed 1: run"
+    assert sweep.main(command(place)) == 0 and results(capsys.readouterr().out) == ["finished"]
 
 
 def test_a_crash_is_retried_once_from_the_checkpoint(place, capsys):
@@ -365,7 +445,7 @@ def are_gone(numbers):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_stopped_sweep_ends_its_scripts_and_can_go_on(place, number, capsys):
     """Ctrl-C reaches the whole process group of a sweep. Two runs have a checkpoint then, the third has not begun."""
     arguments = command(place, "--pause=0.1", seeds="1-3")
@@ -383,6 +463,22 @@ def test_a_stopped_sweep_ends_its_scripts_and_can_go_on(place, number, capsys):
     assert sweep.main(arguments) == 0
     assert results(capsys.readouterr().out) == ["finished"] * 3 and logs(place).count("--resume") == 2
     assert len(run_folders(place)) == 3 and not unfinished(place)
+
+
+def test_under_nohup_a_closed_terminal_stops_nothing(place, capsys):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert sweep.main(command(place)) == 0
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN and results(capsys.readouterr().out) == ["finished"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["2>&-", "2>/dev/full"])
+def test_a_closed_or_full_stderr_stops_nothing(place, way):
+    words = shlex.join([sys.executable, str(place / "benchmark" / "sweep.py"), *command(place, "--crashes=1")])
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(f"{words} {way}", shell=True, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 0 and results(done.stdout) == ["finished"]
+    assert len(done.stdout.splitlines()) == 2, "the closing table alone"
 
 
 @pytest.mark.slow
@@ -414,7 +510,7 @@ def test_recorded_runs_are_kept_and_skipped_without_their_folders(place, capsys)
     assert sweep.main(command(place, seeds="1-3", own=keep)) == 0, "those that were finished before are recorded, too"
     runs, evaluations = recorded(place)
     assert sorted(runs["seed"]) == [1, 2, 3] and list(runs) == record.RUNS
-    assert set(runs["checksum"]) == {record.checksum("counter", "bp-10")} and set(runs["steps"]) == {4}
+    assert set(runs["checksum"]) == {record.checksum("counter", "wtd-s")} and set(runs["steps"]) == {4}
     assert set(runs["flags"]) == set(runs["variant"]) == {""}
     assert all(text.endswith(f", {torch.backends.cpu.get_cpu_capability()}") for text in runs["processor"])
     one = evaluations[evaluations["seed"] == 2]
@@ -427,7 +523,7 @@ def test_recorded_runs_are_kept_and_skipped_without_their_folders(place, capsys)
     assert len(run_folders(place)) == 1 and len(recorded(place)[0]) == 4
 
     assert sweep.main(command(place, "--note=a", seeds="1", own=[*keep, "--variant", "mine"])) == 0, "other flags"
-    (place / "counter.py").write_text(COUNTER + "# changed\n")
+    (place / "counter.py").write_text(COUNTER + "changed = True\n")
     assert sweep.main(command(place, seeds="1", own=keep)) == 0, "other code"
     assert results(capsys.readouterr().out) == ["finished"] * 2
     runs, evaluations = recorded(place)

@@ -71,7 +71,7 @@ CHANGES = {  # what a slip in one script looks like, and what the report then sa
     "a shared method": ("avf_qplex", "rng.integers(len(", "rng.choice(len(", "ReplayBuffer.sample"),
     "a class of another name": ("mac_iaicc", "self.running_rows[over] = 0", "pass", "ReplayBuffer.end_episodes"),
     "a class's docstring": ("avf_vdn", "Agents share no weights", "Agents share nothing", "Agents"),
-    "a comment in one": ("mac_iaicc", "# runs no code of the file", "# safe", "load"),
+    "a comment in one": ("mac_iaicc", "# half a file, where the disk is full", "# half a file", "save"),
     "a group's member": ("avf_qmix", '"real": (last_state', '"real": (state', "mixer_states"),
     "a setting's value": ("cen_maddrqn", "td_lambda: float = 0.8", "td_lambda: float = 0.9", "Args.td_lambda"),
     "a setting's type": ("avf_vdn", "seed: int", "seed: float", "Args.seed"),
@@ -106,7 +106,7 @@ def test_drift_is_seen(change):
         ("evaluate", "running &= ~over"),
         ("ReplayBuffer.begin_rows", "self.running_rows[e] += 1"),
         ("Args.gamma", "gamma: float = 0.95"),
-        ("Args.__post_init__", "problem = envs.problem"),
+        ("Args.__post_init__", "kind = type(getattr"),
         ("DEFAULTS.bp-", '"bp-": dict('),
     ],
 )

@@ -12,6 +12,7 @@ import envs
 import play
 import timeline
 from envs.rendering import AGENTS, ALARM, GREEN_DARK, INK
+from tests import fonts
 from tests.recording import scripted
 
 
@@ -244,6 +245,23 @@ def test_abbreviations_of_one_agents_macro_actions_differ():
         for names in envs.make(env_id).macro_action_names:
             assert len({timeline.shorten(name) for name in names}) == len(names)
     assert [timeline.shorten(name) for name in ("Pass-to-M(0)", "Go-TR", "Stay", "N")] == ["PtM(0)", "GTR", "St", "N"]
+    odd = {"-1": "-1", "Wait-": "Wa", "": "", "-": "-", "A--B": "AB", "-(0)": "-(0)", "Иди-к-двери(0)": "Икд(0)"}
+    assert {name: timeline.shorten(name) for name in odd} == odd
+
+
+ODD = ["-1", "Wait-", "", "A--B", "$x^$ costs $5", "Иди-к-двери(0)", "去工作室", "去-工(0)"]
+
+
+@pytest.mark.parametrize("steps", [None, (0, 40), (3, 8)])
+def test_odd_names_and_other_scripts_are_drawn_and_cover_nothing(steps, tmp_path, recwarn):
+    episode = random_episode("bp-10")._replace(names=[ODD, ODD])
+    with fonts.installed(tmp_path / "font.ttf"):
+        figure = timeline.draw(episode, "去工作室 и $x^$", "facts", steps)
+        assert not covered(figure)
+        timeline.save(figure, tmp_path / "team.svg", "svg")
+    assert not [str(warning.message) for warning in recwarn if "missing" in str(warning.message)]
+    text = (tmp_path / "team.svg").read_text()
+    assert "$x^$ costs $5" in text and "去工作室 и $x^$" in text
 
 
 def test_names_without_room_are_shortened_or_written_once_and_explained(episode):

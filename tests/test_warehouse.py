@@ -137,6 +137,18 @@ def test_steps_of_waiting_are_counted_from_the_step_after_the_arrival():
     assert until_done(near, (GET_TOOL, GO_W, WAIT), agent=0)[0] == 9
 
 
+def test_a_detour_of_one_step_does_not_begin_the_wait_anew():
+    """Only a step that ends short of the waypoint does. Here the tool room is a step from the table."""
+    near = started(tables=[(0.8, 3.0), (1.2, 3.0)], starts=[(0.8, 3.0), (1.2, 3.0)], tool_room=(0.8, 3.5))
+    assert until_done(near, (GET_TOOL, GET_TOOL, WAIT), agent=0)[0] == 10
+    assert until_done(near, (GO_TR, GET_TOOL, WAIT), agent=0)[0] == 1
+    assert until_done(near, (GET_TOOL, GET_TOOL, WAIT), agent=0)[0] == 9
+    far = started(tables=[(0.8, 3.0), (1.2, 3.0)], starts=[(0.8, 3.0), (1.2, 3.0)], tool_room=(0.8, 4.1))
+    assert until_done(far, (GET_TOOL, GET_TOOL, WAIT), agent=0)[0] == 10
+    assert until_done(far, (GO_TR, GET_TOOL, WAIT), agent=0)[0] == 2
+    assert until_done(far, (GET_TOOL, GET_TOOL, WAIT), agent=0)[0] == 2 + 10
+
+
 def test_search_then_pass_ends_get_tool():
     env = started()
     assert until_done(env, (GET_TOOL, GET_TOOL, SEARCH_1), agent=2)[0] == 6
@@ -328,6 +340,9 @@ def test_keyword_overrides_the_layout():
     ({"workshops": []}, "workshops must be a list with at least one entry, got []"),
     ({"tool_room": (1, 2, 3)}, "tool_room must be finite numbers of shape (2,), got (1, 2, 3)"),
     ({"room_size": (9, 0)}, "room_size must be above 0, got (9, 0)"),
+    ({"layout": np.array(["s", "d"])}, "unknown layout array(['s', 'd'], dtype='<U1'); valid layouts: s d t t1"),
+    ({"copies": 2**63}, "copies must be at most 10**15, got [9223372036854775808"),
+    ({"pass_steps": 1e300}, "pass_steps must be at most 10**15, got 1e+300"),
     ({"copies": 0}, "copies must be finite numbers of shape (3,) of at least 1, got [0, 0, 0]"),
     ({"copies": (1, 1)}, "copies must be finite numbers of shape (3,) of at least 1, got (1, 1)"),
     ({"search_steps": 2.5}, "search_steps must be whole, got 2.5"),

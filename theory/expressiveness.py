@@ -10,7 +10,9 @@ situation. A situation says what is available to each agent. Names, besides thos
 `python -m theory.expressiveness` prints the tables of README.md.
 """
 
+import argparse
 import itertools
+import sys
 from functools import cache
 
 import numpy as np
@@ -20,7 +22,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from avf_qmix import QMIXMixer
 from avf_qplex import QPLEXMixer
 from theory.igm import mac_igm_batch, open_actions, paper_available, situations
-from theory.variants import ToldAvailable, VDNMixer, own_actions
+from theory.variants import ToldAvailable, ToldB, ToldLambda, VDNMixer, own_actions
 
 
 def qplex(own, state_size):
@@ -45,7 +47,9 @@ MIXERS = {
     "QMIX": qmix,
     "literal": literal_qplex,
     "as shipped": qplex,  # conditioned on what is available
-    "told available": ToldAvailable,  # conditioned, and its weights see what is available
+    "b told": ToldB,  # conditioned, and b_i sees what is available
+    "lambda told": ToldLambda,  # conditioned, and lambda_i sees it
+    "told available": ToldAvailable,  # conditioned, and all weights see it
 }
 
 
@@ -63,7 +67,7 @@ def joint_tables(mixer, utilities, available, state, values=None):
     """The mixer's value of every joint action. Values of those that are not available mean nothing.
 
     Args:
-        mixer: called as the mixers of the scripts are, in float64.
+        mixer: called as the mixers of the scripts are, in float64. (All can be float32, too.)
         utilities: n float64 arrays [batch, |M^i|].
         available: n bool arrays [batch, |M^i|] or [|M^i|].
         state: float64 [batch, S].
@@ -205,7 +209,7 @@ def is_consistent(q):
 
 
 # ---- the classes of mixers as cones ---------------------------------------------------------------------------------
-CLASSES = ("VDN", "QMIX", "monotone", "literal", "as shipped", "told available")
+CLASSES = ("VDN", "QMIX", "monotone", "literal", "as shipped", "b told", "lambda told", "told available")
 
 
 def cone(name, sizes, ranks):
@@ -239,8 +243,8 @@ def coefficients(name, sizes, ranks, available, m):
     "QMIX": rises, and has rising differences (one layer of ELU is convex); a bound, for 2 agents. The others are QPLEX
     with w_i > 0, b_i and lambda_i >= 0 free: b + sum_i w_i V_i gives a 1. Each disadvantage of a macro-action that is
     not greedy gives a -1, in V_i if the agent is busy and conditioned, else in lambda_i A_i. "literal": not
-    conditioned, its weights do not see what is available. "as shipped": conditioned, same weights. "told available":
-    its weights see it, too.
+    conditioned, its weights do not see what is available. "as shipped": conditioned, same weights. "b told", "lambda
+    told", "told available": the b_i, the lambda_i, all weights see it, too.
     """
     rank = tuple(order[m_i] for order, m_i in zip(ranks, m, strict=True))
     worse = [i for i, size in enumerate(sizes) if rank[i] < size - 1]
@@ -273,7 +277,18 @@ def coefficients(name, sizes, ranks, available, m):
             cause = m if is_free[i] else m[i]
             entry["loss", i, cause] = -1
         return entry
+    if name == "b told":
+        entry = {("value", available): 1}  # with V_i of busy agents
+        for i in worse:
+            if is_free[i]:
+                entry["loss", i, m] = -1
+        return entry
     entry = {("value", available): 1}
+    if name == "lambda told":
+        entry = {("value",): 1}
+        for i in worse:
+            if not is_free[i]:
+                entry["loss", i, m[i]] = -1
     if any(is_free[i] for i in worse):
         entry["loss", available, m] = -1
     return entry
@@ -452,7 +467,10 @@ def fire(layer, unit, own, available, m=None):
 
 
 # ---- the tables of README.md ----------------------------------------------------------------------------------------
-def main():
+def main(argv=None):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.error = lambda message: sys.exit(f"expressiveness: {message}")
+    parser.parse_args(argv)  # there are no options but --help
     torch.set_num_threads(1)
     print("Mac-IGM violations in 2,000 random situations: lambda free / literal at initialisation / as shipped")
     for agents, size in itertools.product((2, 3, 4), (2, 3, 5)):

@@ -183,10 +183,8 @@ def adv_igm(q, utilities, ties="equal"):
     Raises:
         ValueError: as `igm`.
     """
-    q, utilities = _tables(q, utilities)
-    advantage = exact(q) - exact(q).max()
+    advantage, own_advantages = advantages(q, utilities)
     joint = set(map(tuple, np.argwhere(advantage == 0).tolist()))
-    own_advantages = [exact(u) - exact(u).max() for u in utilities]
     greedy = [np.flatnonzero(a == 0).tolist() for a in own_advantages]
     return _compare(advantage, joint, set(itertools.product(*greedy)), ties)
 
@@ -194,13 +192,13 @@ def adv_igm(q, utilities, ties="equal"):
 def macadv_igm(q, utilities, available, value=None, values=None, ties="equal"):
     """MacAdv-IGM (Def. 3.3, Eq. 11): Mac-IGM for A = Q - V and A_i = Q_i - V_i, for any V and V_i.
 
-    Unlike Adv-IGM it bounds no advantage: V and V_i are free. Differences are taken exactly. In floating point Q - V
-    rounds, which makes ties that Q does not have, and Prop. 3.4 fails (`test_rounding_breaks_prop_3_4`).
+    Unlike Adv-IGM it bounds no advantage: V and V_i are free. They are constants of the tables compared, so no argmax
+    sees them, which is the whole of Prop. 3.4. In floating point Q - V rounds, which makes ties that Q does not have,
+    and Prop. 3.4 fails (`test_rounding_breaks_prop_3_4`).
 
     Args:
         q, utilities, available, ties: as in the module's docstring.
-        value: V(h), a finite number; None: max Q (Eq. 4).
-        values: V_i(h^i), n finite numbers; None: max Q_i (Eq. 4).
+        value, values: V(h) and the V_i(h^i), as in `advantages`.
 
     Returns:
         Verdict, its margin in units of A.
@@ -208,13 +206,31 @@ def macadv_igm(q, utilities, available, value=None, values=None, ties="equal"):
     Raises:
         ValueError: as `mac_igm`.
     """
+    advantage, own_advantages = advantages(q, utilities, value, values)
+    return mac_igm(advantage, own_advantages, available, ties)
+
+
+def advantages(q, utilities, value=None, values=None):
+    """A = Q - V and A_i = Q_i - V_i (Eq. 3), exactly.
+
+    Args:
+        q, utilities: as in the module's docstring.
+        value: V(h), a finite number; None: max Q (Eq. 4).
+        values: V_i(h^i), n finite numbers; None: max Q_i (Eq. 4).
+
+    Returns:
+        A, and a list of the n A_i: object arrays of Fractions, of the shapes of q and utilities.
+
+    Raises:
+        ValueError: as `igm`.
+    """
     q, utilities = _tables(q, utilities)
     if value is None:
         value = np.max(q)
     if values is None:
         values = [np.max(u) for u in utilities]
-    advantages = [exact(u) - exact(v) for u, v in zip(utilities, values, strict=True)]
-    return mac_igm(exact(q) - exact(value), advantages, available, ties)
+    own_advantages = [exact(u) - exact(v) for u, v in zip(utilities, values, strict=True)]
+    return exact(q) - exact(value), own_advantages
 
 
 def mac_igm_batch(q, utilities, available, ties="equal", tolerance=0.0):

@@ -31,6 +31,7 @@ import avf_qmix
 import avf_vdn
 import envs
 from envs.box_pushing import PUSH, WAYPOINT_BIG_LEFT
+from theory.picture import png
 
 BIG = 99.6  # G: four steps to the goal row
 FAILS = 10.1  # F: a push in vain
@@ -137,12 +138,24 @@ def joint_values(script, args, learner, utilities, actions, batch):
 
 
 # ---- the program ----------------------------------------------------------------------------------------------------
-def main(argv=None):
+def parse_args(argv=None):
+    """The options; errors are one line, before anything is played or trained."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.error = lambda message: sys.exit(f"optimism: {message}")
     parser.add_argument("--steps", type=int, default=150_000, help="of each run, at random (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=101, help="default: %(default)s")
-    parser.add_argument("-o", "--output", type=Path, help="the figure, PNG")
+    parser.add_argument("-o", "--output", type=png, help="the figure, PNG")
     options = parser.parse_args(argv)
+    if options.steps < 0:
+        parser.error(f"--steps must not be negative, got {options.steps}")
+    if options.output and not options.steps:
+        parser.error("the figure of --output needs runs, and --steps 0 makes none")
+    avf_qmix.parse_args(["--env=bp-10", f"--seed={options.seed}", f"--total-timesteps={options.steps or 1}"])
+    return options
+
+
+def main(argv=None):
+    options = parse_args(argv)
     gamma = avf_qmix.parse_args(["--env=bp-10"]).gamma
     for env_id in ("bp-10", "bp-20", "bp-30"):
         p, share = push_beside_random_partner(env_id)
@@ -197,4 +210,10 @@ def draw(found, p, gamma, path):
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except OSError as error:  # a full disk
+        sys.exit(f"optimism: {error}")
+    except KeyboardInterrupt:
+        print("optimism: stopped; what is printed stays", file=sys.stderr)
+        sys.exit(130)

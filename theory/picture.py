@@ -7,6 +7,8 @@ those of `igm.mac_igm`.
 """
 
 import argparse
+import importlib.util
+import os
 import sys
 from pathlib import Path
 
@@ -96,9 +98,21 @@ def draw(path):
     plt.close(figure)
 
 
+def png(words):
+    """The path of a picture on the command line, of a PNG file that can be written, or argparse's one line."""
+    path = Path(words)
+    if importlib.util.find_spec("matplotlib") is None:
+        raise argparse.ArgumentTypeError("pictures need matplotlib: pip install -e '.[report]'")
+    target = path if path.exists() else path.parent
+    if path.suffix.lower() != ".png" or path.is_dir() or not os.access(target, os.W_OK):
+        raise argparse.ArgumentTypeError(f"cannot write {words!r}: it has to be a .png file in a folder that exists")
+    return path
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, help="the picture, PNG; without it the numbers are printed alone")
+    parser.error = lambda message: sys.exit(f"picture: {message}")
+    parser.add_argument("-o", "--output", type=png, help="the picture, PNG; without it the numbers are printed alone")
     options = parser.parse_args(argv)
     for title, q, verdict in panels():
         print(f"{title}: {q.tolist()}, {verdict}")
@@ -107,4 +121,7 @@ def main(argv=None):
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except OSError as error:  # a full disk
+        sys.exit(f"picture: {error}")

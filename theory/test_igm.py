@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from theory.igm import (
     TIES,
     adv_igm,
+    advantages,
     conditional_argmax,
     exact,
     igm,
@@ -185,6 +186,26 @@ def test_local_choices_by_hand():
         assert local_choices(utilities, available) == expected
 
 
+def test_eq_7_over_all_macro_actions_is_not_eq_7_over_what_can_be_started():
+    """Agent 2 is free and cannot start a. Read over all of M^2, as written, Defs. 3.1 and 3.3 can name a as its choice.
+
+    By hand: as written Eq. 7 holds in the first case and fails in the second. Over what can be started it is reversed.
+    """
+    q = matrix("4 0 3", "0 2 1")
+    everything = all_free((2, 3))
+    can_start = can("xx", ".xx")
+    first = own("1 0", "2 1 0")
+    assert conditional_argmax(q, everything) == local_choices(first, everything) == {(0, 0)}
+    assert (0, 0) not in open_actions(can_start)
+    second = own("1 0", "0 0 1")
+    for ties in TIES:
+        for holds in (mac_igm, macadv_igm):
+            assert holds(q, first, everything, ties=ties)
+            assert not holds(q, first, can_start, ties=ties)  # takes (a, b), worth 0
+            assert not holds(q, second, everything, ties=ties)  # takes (a, c), worth 3
+            assert holds(q, second, can_start, ties=ties)
+
+
 def test_an_initiation_set_can_break_mac_igm():
     """By hand, with agent 1 free to do both: it depends on which two of its three macro-actions agent 2 can start."""
     q = matrix("4 0 3", "0 2 1")
@@ -339,7 +360,11 @@ def test_all_busy_is_no_demand(ties, table, data):
 @MANY
 @given(table=tables(), data=st.data())
 def test_prop_3_4_mac_igm_is_macadv_igm(ties, table, data):
-    """Same verdict and same joint action for every table, whatever is available, and for any V and V_i."""
+    """Same verdict and same joint action for every table, whatever is available, and for any V and V_i.
+
+    This is a remark: V and V_i are constants, which no argmax sees, so no table can tell the two definitions apart. The
+    test guards the code alone. What can fail is tested below: rounding, and the form of Adv-IGM, which sees V.
+    """
     q, utilities = table
     available = draw_each(data, q.shape, sets_of_macro_actions)
     value, values = draw_values(data, q.shape)
@@ -357,6 +382,61 @@ def test_prop_3_4_in_every_situation(table, data):
     for available in situations(q.shape):
         mac = mac_igm(q, utilities, available)
         assert macadv_igm(q, utilities, available, value, values).holds == mac.holds
+
+
+def test_advantages_by_hand():
+    q = matrix("3 1", "2 0")
+    utilities = own("1 0", "5 7")
+    everything = all_free((2, 2))
+    joint, of_agents = advantages(q, utilities)  # Eq. 4: V = 3, V_i = 1 and 7
+    assert joint.tolist() == [[0, -2], [-1, -3]]
+    assert [a.tolist() for a in of_agents] == [[0, -1], [-2, 0]]
+    joint, of_agents = advantages(q, utilities, 2, [0, 6])
+    assert joint.tolist() == [[1, -1], [0, -2]]
+    assert [a.tolist() for a in of_agents] == [[1, 0], [-1, 1]]
+    assert macadv_igm(q, utilities, everything, 2, [0, 6]) == (False, (0, 1), 2)
+
+
+def without_disadvantage(q, utilities, available, value=None, values=None):
+    """The two sets that Adv-IGM compares, of what is available: A = 0, and A_i = 0 for every agent."""
+    joint, of_agents = advantages(q, utilities, value, values)
+    actions = open_actions(available)
+    jointly = {m for m in actions if joint.item(m) == 0}
+    locally = {m for m in actions if all(a[m_i] == 0 for a, m_i in zip(of_agents, m, strict=True))}
+    return jointly, locally
+
+
+@ties_of_every_kind
+@MANY
+@given(table=tables(), data=st.data())
+def test_adv_igms_form_carries_over_if_v_is_of_what_is_available(ties, table, data):
+    """Mac-IGM is: A = 0 where all A_i = 0, if V and V_i are maxima over what is available (the authors' revision)."""
+    q, utilities = table
+    available = draw_each(data, q.shape, sets_of_macro_actions)
+    value = max(q.item(m) for m in open_actions(available))
+    values = [u[mask].max() for u, mask in zip(utilities, available, strict=True)]
+    jointly, locally = without_disadvantage(q, utilities, available, value, values)
+    holds = {
+        "equal": jointly == locally,
+        "every": jointly >= locally,
+        "some": bool(jointly & locally),
+    }
+    assert mac_igm(q, utilities, available, ties).holds == holds[ties]
+
+
+def test_adv_igms_form_does_not_carry_over_with_eq_4():
+    """With V = max Q and V_i = max Q_i over everything, nothing that is available need be without a disadvantage.
+
+    Agent 2 is busy with b. In the first table Mac-IGM holds and both sets are empty. In the second it holds, too, and
+    the sets differ: the best of all joint actions is available, agent 2's best macro-action is not.
+    """
+    goes_on = can("xx", ".x")
+    q = matrix("2 1", "1 0")
+    assert mac_igm(q, own("1 0", "1 0"), goes_on)
+    assert without_disadvantage(q, own("1 0", "1 0"), goes_on) == (set(), set())
+    q = matrix("0 2", "0 1")
+    assert mac_igm(q, own("1 0", "1 0"), goes_on)
+    assert without_disadvantage(q, own("1 0", "1 0"), goes_on) == ({(0, 1)}, set())
 
 
 @MANY
@@ -379,6 +459,9 @@ def test_rounding_breaks_prop_3_4():
     assert not mac_igm(q - v, utilities, available)
     rounded = [u - v for u in utilities]
     assert not mac_igm(q, rounded, available, ties="every")
+    q = matrix("0 0", "0 1")  # where Mac-IGM fails, to which a tie helps
+    assert not mac_igm(q, utilities, available, ties="some")
+    assert mac_igm(q - v, utilities, available, ties="some")
 
 
 @MANY

@@ -16,6 +16,8 @@ from theory.process import (
     TRIPS,
     VIEWS,
     Delivery,
+    Interval,
+    Row,
     is_function_of_row,
     learned,
     mixer_state,
@@ -118,6 +120,52 @@ def test_every_row_is_a_decision_and_macro_states_date_from_the_last_choice():
             assert row.macro_states[i][1] == row.time - row.elapsed[i]
 
 
+class TwoSituations:
+    """As much of a process as errors need: two rows that look alike but for time, and are visited 3 times and once.
+
+    The first is worth 2. The second ends in one of two ways, with returns 4 (probability 1/4) and 0, so it is worth 1.
+    Each of the first leads to the second.
+    """
+
+    def __init__(self):
+        macros = ("cart", "open")
+        chosen = (False, True)
+        looks = (("cart",), ("open",)), (1,), ((0,), (1,))  # histories, state, macro_states
+        often, seldom = (Row(1, 1, time, macros, chosen, (1, 0), *looks) for time in (3, 4))
+        self.rows = {often: Fraction(3), seldom: Fraction(1)}
+        self.values = {often: Fraction(2), seldom: Fraction(1)}
+        ended = (False, True)
+        one = Fraction(1)
+        self.ways = {
+            often: [Interval(one, Fraction(2), one, (1,), ended, {seldom: one})],
+            seldom: [
+                Interval(Fraction(1, 4), Fraction(4), one, (1,), ended, {}),
+                Interval(Fraction(3, 4), Fraction(0), one, (1,), ended, {}),
+            ],
+        }
+
+    def intervals(self, row):
+        return self.ways[row]
+
+    def value(self, row):
+        return self.values[row]
+
+    def outcome(self, interval):
+        return interval.reward
+
+
+def test_errors_by_hand_are_weighted_by_visits():
+    """Learned is (3 x 2 + 1 x 1) / 4 = 7/4; the error (3 x 1/16 + 1 x 9/16) / 4 = 3/16.
+
+    Without weights these were 3/2 and 1/4. The target asks for the second row alone, worth 1: an error of 9/16.
+    """
+    process = TwoSituations()
+    fit = learned(process, "decision", "histories")
+    assert list(fit.values()) == [Fraction(7, 4)]
+    assert value_error(process, "decision", "histories") == Fraction(3, 16)
+    assert target_error(process, "decision", "histories") == (0, Fraction(9, 16))
+
+
 # ---- which input determines the joint value -------------------------------------------------------------------------
 @every_input
 @every_state
@@ -218,6 +266,30 @@ def test_histories_matter_if_policies_use_them(shows):
     process = Delivery(shows, policy=opens_once)
     assert determines(process, "decision+elapsed") == WITH_HISTORIES
     assert determines(process, "joint") == (NEVER if shows == "trips" else WITH_HISTORIES)
+
+
+# ---- a macro-action that ends by chance -----------------------------------------------------------------------------
+def test_the_joint_macro_history_tells_who_is_free_only_without_chance():
+    """Eq. 6 has M^+ as a function of macro-histories. It is one where terminations are certain, and not by chance.
+
+    By hand: the first trip is made by hand, and the keeper has tidied. If this took 2 steps both choose now. If it took
+    1, the keeper has begun something else and goes on. So one joint macro-history has two sets M^+. The next trip by
+    cart, while the keeper tidies, is worth 7/8 with the first and 3/4 with the second.
+    """
+    together = (True, True)
+    carrier_alone = (True, False)
+    values = {}  # by joint macro-history, then by who chose
+    for row in delivery("position").rows:
+        value = delivery("position").value(row)
+        values.setdefault(row.histories, {}).setdefault(row.chosen, {})[row.macros] = value
+    of_one = values[(("hand", False),), (("tidy",),)]
+    assert set(of_one) == {together, carrier_alone}
+    assert of_one[together]["cart", "tidy"] == Fraction(7, 8)
+    assert of_one[carrier_alone]["cart", "tidy"] == Fraction(3, 4)
+    certain = {}
+    for row in delivery("position", False).rows:
+        certain.setdefault(row.histories, set()).add(row.chosen)
+    assert all(len(chosen) == 1 for chosen in certain.values())
 
 
 # ---- the real state -------------------------------------------------------------------------------------------------

@@ -38,6 +38,27 @@ class ToldAvailable(QPLEXMixer):
         return super().forward(utilities, actions, available, seen)
 
 
+class ToldB(QPLEXMixer):
+    """QPLEX of which the b_i alone see what is available. Only their sum matters, so it is a network of its own."""
+
+    def __init__(self, own_actions, state_size, hidden=128, **options):
+        super().__init__(own_actions, state_size, hidden, **options)
+        inputs = state_size + own_actions.numel()
+        self.bias_net = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+
+    def forward(self, utilities, actions, available, state):
+        seen = torch.cat([state, available.flatten(-2)], -1)
+        return super().forward(utilities, actions, available, state) + self.bias_net(seen)[..., 0]
+
+
+class ToldLambda(ToldAvailable):
+    """QPLEX of which the lambda_i alone see what is available: w_i and b_i are functions of the state."""
+
+    def __init__(self, own_actions, state_size, *args, **options):
+        super().__init__(own_actions, state_size, *args, **options)
+        self.state_net = TwoViews(self.state_net, state_size, 2 * len(own_actions))
+
+
 class Dueling(QPLEXMixer):
     """QPLEX with dueling heads (Def. 3.3): V_i is free, so that advantages may have any sign.
 
@@ -61,6 +82,21 @@ class FirstInputs(nn.Module):
     def forward(self, inputs):
         place = torch.arange(inputs.shape[-1])
         return torch.where(place < self.count, inputs, 0.0)
+
+
+class TwoViews(nn.Module):
+    """A network whose first outputs see the first inputs alone, and whose other outputs see all inputs."""
+
+    def __init__(self, net, first_inputs, first_outputs):
+        super().__init__()
+        self.net = net
+        self.narrow = FirstInputs(first_inputs)
+        self.first_outputs = first_outputs
+
+    def forward(self, inputs):
+        narrow = self.net(self.narrow(inputs))[..., : self.first_outputs]
+        wide = self.net(inputs)[..., self.first_outputs :]
+        return torch.cat([narrow, wide], -1)
 
 
 def with_lambda_of_state(mixer):
