@@ -175,6 +175,17 @@ def make_single(env_id, domain, **kwargs) -> SingleMacroEnv:
 
 make_single.metadata = SingleMacroEnv.metadata  # Gymnasium makes "human" and "rgb_array_list" of these render modes
 
+
+def to_pettingzoo(env_id, **kwargs):
+    """Makes one environment as a PettingZoo `ParallelEnv`, see `envs.pettingzoo_export.MacroParallelEnv`.
+
+    Arguments and errors as `make`. It needs PettingZoo: `pip install -e '.[simulators]'`.
+    """
+    from envs.pettingzoo_export import MacroParallelEnv  # here, since PettingZoo is optional
+
+    return MacroParallelEnv(make(env_id, **kwargs))
+
+
 register("bp-10", BoxPushing, grid=10)
 register("bp-20", BoxPushing, grid=20)
 register("bp-30", BoxPushing, grid=30)

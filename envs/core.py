@@ -139,6 +139,9 @@ class MacroVectorEnv(VectorEnv, ABC):
         """
         return self._own_everywhere
 
+    def _restore(self):
+        """Called by `load_state` after the arrays are set. A domain that holds more than arrays makes it from them."""
+
     @abstractmethod
     def _draw(self, index):
         """A picture, uint8 [height, width, 3], of one environment."""
@@ -332,6 +335,7 @@ class MacroVectorEnv(VectorEnv, ABC):
             loaded = np.frombuffer(saved[name], array.dtype).reshape(array.shape)
             setattr(self, name, loaded.copy())
         self.np_random.bit_generator.state = json.loads(saved["np_random"])
+        self._restore()
         self._update_available()
         return self._obs.copy(), self._infos()
 

@@ -100,11 +100,11 @@ def interrupted(monkeypatch, module, args, steps):
     return folder
 
 
-def resume(module, folder):
+def resume(module, folder, *flags):
     """Goes on with a run, but not in the second in which it began: TensorBoard orders its files by the second."""
     began = max(int(path.name.split(".")[3]) for path in folder.glob("events.*"))
     wait_for(lambda: time.time() >= began + 1)
-    assert module.train(module.parse_args([f"--resume={folder}"])) == folder
+    assert module.train(module.parse_args([f"--resume={folder}", *flags])) == folder
     assert not (folder / "checkpoint.pt").exists()
 
 
