@@ -177,6 +177,12 @@ def test_a_vegetable_goes_on_a_plate_on_a_board_and_the_cook_has_both():
         assert cell_of(env, PLATE, TOMATO) == [place, (1, 1)], "only if it is chopped"
 
 
+def test_an_unchopped_vegetable_is_not_put_where_another_cook_has_just_taken_the_plate():
+    env = started("c", {COOK_0: (3, 2), COOK_1: (3, 4), TOMATO: (3, 4), PLATE: (3, 3)})
+    run(env, (GET_PLATE, GET_PLATE, STAY))
+    assert held(env) == [PLATE, TOMATO, NOTHING]
+
+
 def test_an_unchopped_vegetable_is_not_plated_and_not_exchanged():
     env = started(places={COOK_1: (5, 5), TOMATO: (5, 5)}, strikes=(2, 0, 0))
     assert run(env, (STAY, GET_PLATE, STAY))[1][1] and held(env)[1] == TOMATO
@@ -301,7 +307,7 @@ def test_the_last_move_needs_the_thing_to_be_there():
 
 
 def test_get_ends_at_once_if_the_thing_is_in_sight_and_out_of_reach():
-    env = started(places={COOK_0: (2, 2), COOK_1: (2, 3), LETTUCE: (2, 3), ONION: (2, 0), PLATE: (2, 0)})
+    env = started(places={COOK_0: (2, 2), COOK_1: (2, 4), LETTUCE: (2, 4), ONION: (2, 0), PLATE: (2, 0)})
     before = cell_of(env, COOK_0)
     for action, why in ((GET_LETTUCE, "in a hand"), (GET_ONION, "on a plate")):
         assert run(env, (action, STAY, STAY)) == ([-0.1], [True] * 3), why
