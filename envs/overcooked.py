@@ -337,7 +337,7 @@ class Overcooked(MacroVectorEnv):
         success = np.zeros(self.num_envs, bool)
         to_move = np.ones(moves.shape, bool)
         while to_move.any():  # a cook may have to wait until another one has moved
-            for cook in range(COOKS):
+            for cook in np.flatnonzero(to_move.any(axis=0)):
                 reward, is_right = self._move(cook, moves, to_move)
                 rewards += reward
                 success |= is_right
@@ -450,7 +450,7 @@ class Overcooked(MacroVectorEnv):
         """
         acts = self._meet(cook, moves, to_move)
         own = self.cell[:, COOK + cook].copy()
-        front = own + STEP[moves[:, cook]]
+        front = own + STEP[moves[:, cook]]  # without a move its own cell, to which it "walks" then
         things = self._thing_in(np.column_stack([own, front]))
         held, thing = things.T
         held_is_chopped, thing_is_chopped = self._is_chopped(things).T
@@ -460,7 +460,7 @@ class Overcooked(MacroVectorEnv):
         to_delivery = front == self.starts[DELIVERY]
 
         walks = acts & to_floor
-        works = acts & ~to_floor
+        works = acts & ~to_floor  # at a counter
         chops = works & (held == NOTHING) & to_board & thing_is_raw
         takes = works & (held == NOTHING) & (thing != NOTHING) & ~chops
         puts_down = works & (held != NOTHING) & (thing == NOTHING) & ~to_delivery
@@ -492,16 +492,18 @@ class Overcooked(MacroVectorEnv):
         to_move[:, cook] = False
         own = self.cell[:, COOK + cook].copy()
         front = own + STEP[moves[:, cook]]
-        for other in np.delete(np.arange(COOKS), cook):
+        for other in range(COOKS):
+            if other == cook:
+                continue
             others_cell = self.cell[:, COOK + other].copy()
             others_front = others_cell + STEP[moves[:, other]]
             meets = acts & (front == others_cell)
             swaps = meets & to_move[:, other] & (others_front == own)
             waits = meets & to_move[:, other] & ~swaps
-            here = self.cell == own[:, None]
-            there = self.cell == others_cell[:, None]
-            self.cell = np.where(swaps[:, None] & here, others_cell[:, None], self.cell)
-            self.cell = np.where(swaps[:, None] & there, own[:, None], self.cell)
+            goes = swaps[:, None] & (self.cell == own[:, None])  # the cook and what it holds
+            comes = swaps[:, None] & (self.cell == others_cell[:, None])
+            self.cell = np.where(goes, others_cell[:, None], self.cell)
+            self.cell = np.where(comes, own[:, None], self.cell)
             to_move[swaps, other] = False
             to_move[waits, cook] = True
             acts = acts & ~meets
