@@ -204,9 +204,9 @@ class Overcooked(MacroVectorEnv):
           and Deliver end if the cook holds nothing.
         - A cook makes room: it moves right instead if it believes a cook to be beside board 1 and it is beside board 0
           with Deliver, or beside the delivery counter with board 0 as its target.
-    - 9 Chop: the cook strikes what is on the board beside it. It ends without a move if that is not an unchopped
-      vegetable, and with the third move. These are counted whether they strike or not, because the cook's hand is full,
-      and the count outlives a Chop that ends early.
+    - 9 Chop: the cook moves towards the board beside it, and strikes what is there. It ends without a move if there is
+      no unchopped vegetable on a board beside it. It ends with the third move. The count of moves outlives a Chop that
+      ends early, and the moves of a cook that holds something, which cannot strike, count, too.
     - 10 Go-to-Counter, in "b" and "c" only: the cook goes to the counter of column 3 that it believes to be empty, of
       several the nearest to row 3. It ends with the move that leads into the counter, or without a move if there is no
       such counter. It goes on without a move while there is no way.
@@ -476,7 +476,7 @@ class Overcooked(MacroVectorEnv):
         self.cell[walks, COOK + cook] = front[walks]
         self._return_to_start(is_wrong, own)
         self.strikes[chops, thing[chops]] += 1
-        is_done = chops & (self._times_chopped(things)[:, 1] == STRIKES)
+        is_done = chops & (self._strikes_of(things)[:, 1] == STRIKES)
 
         rewards = np.where(is_done, self.chop_reward, 0.0)
         rewards += np.where(is_right, self.delivery_reward, 0.0)
@@ -582,27 +582,27 @@ class Overcooked(MacroVectorEnv):
         """Whether there is a board in a cell and an unchopped vegetable on it."""
         return self._is_board(cell) & self._is_raw(self._thing_in(cell))
 
-    def _times_chopped(self, thing):
-        """How often a thing has been chopped, -1 if it is no vegetable."""
+    def _strikes_of(self, thing):
+        """How many strikes a thing has got, -1 if it is no vegetable."""
         is_food = (thing != NOTHING) & (thing < PLATE)
-        times = np.take_along_axis(self.strikes, np.where(is_food, thing, TOMATO), axis=1)
-        return np.where(is_food, times, -1)
+        strikes = np.take_along_axis(self.strikes, np.where(is_food, thing, TOMATO), axis=1)
+        return np.where(is_food, strikes, -1)
 
     def _is_raw(self, thing):
         """Whether a thing is a vegetable that is not chopped."""
-        times = self._times_chopped(thing)
-        return (times >= 0) & (times < STRIKES)
+        strikes = self._strikes_of(thing)
+        return (strikes >= 0) & (strikes < STRIKES)
 
     def _is_chopped(self, thing):
         """Whether a thing is a chopped vegetable."""
-        return self._times_chopped(thing) == STRIKES
+        return self._strikes_of(thing) == STRIKES
 
     # ---- observations, the state and the picture ----------------------------------------------------------------
     def _observe(self, start):
         sees = self._sees()
         places = np.stack([ROW[self.cell], COLUMN[self.cell]], axis=2) / SIDE  # [N, things, 2]
-        chops = self.strikes[:, :, None] / STRIKES
-        foods = np.concatenate([places[:, :PLATE], chops], axis=2)  # [N, 3, 3]
+        strikes = self.strikes[:, :, None] / STRIKES
+        foods = np.concatenate([places[:, :PLATE], strikes], axis=2)  # [N, 3, 3]
         foods_seen = sees[:, :, :PLATE, None] * foods[:, None]
         others_seen = sees[:, :, PLATE:, None] * places[:, None, PLATE:]
         dish = np.zeros((self.num_envs, COOKS, DISHES))
@@ -645,4 +645,4 @@ def _first_moves(own, target, believed):
     searches = np.column_stack([own, target, kinds]).astype(np.uint8)
     distinct, which = np.unique(searches, axis=0, return_inverse=True)
     moves = [first_move(int(row[0]), int(row[1]), row[2:].tobytes()) for row in distinct]
-    return np.array(moves, np.int64)[which]
+    return np.array(moves, np.int64)[which.reshape(-1)]  # NumPy 2.0 gives it a second axis
