@@ -12,6 +12,8 @@ The scripts see the whole simulator. Those of Box Pushing and Warehouse are opti
   the arm needs 10 steps a tool and a robot 7 more to the nearest human, so the last of 6 or 9 tools arrives in step 67
   or 97 at the earliest: 600 - 67 = 533, 900 - 97 = 803.
 - Capture Target: always Move-to-T (with primitive actions: towards the target) is not optimal, only simple.
+- Overcooked: each cook has a part of the work, and idle ones walk about at random, so that nobody is in the way for
+  long. It is not optimal: a wrong delivery, after which chopping pays again, is worth more than it costs.
 
 A policy is a function of (env, rng) that gives the macro-actions, int [N, n], of N environments with n agents; those of
 agents that are not free do not matter.
@@ -29,10 +31,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script, Python looks in this folder only
 
 import envs
+from envs import overcooked as kitchen
 from envs.box_pushing import NORTH, PUSH, STAY, WAYPOINT_BIG_LEFT, WAYPOINT_BIG_RIGHT
 
 # As in the algorithm scripts, so that discounted returns can be put side by side
-GAMMA = {"bp": 0.95, "wtd": 0.95, "ct": 0.9}
+GAMMA = {"bp": 0.95, "wtd": 0.95, "ct": 0.9, "overcooked": 0.95}
 
 # In the order in which the arm hands them out: a robot, and the humans to whom it goes. A human gets its tools in
 # the order in which it needs them. Three robots can always take one tool at a time, in turn.
@@ -108,12 +111,75 @@ def go_to_target(env, rng):
     return np.where(np.abs(dx) > np.abs(dy), np.where(dx > 0, east, west), along_y)
 
 
+def cook_salad(env, rng):
+    """Overcooked: cooks 0 and 2 chop at boards 0 and 1, and one cook collects what is chopped on plate 0.
+
+    In layout "a" cook 1 collects. In the others cook 0 does, and cook 1 puts everything on the counters in the middle.
+    """
+    has_counters = env.middle_counters.size > 0
+    collector = 0 if has_counters else 1
+    is_near = kitchen.COLUMN[env.cell] <= 3 if has_counters else np.ones(env.cell.shape, bool)  # [N, things]
+    actions = env.first_single_step + rng.integers(4, size=env.macro_done.shape)  # of cooks that have nothing to do
+    chop(env, actions[:, 0], 0, 0, [kitchen.TOMATO], is_near)
+    chop(env, actions[:, 2], 2, 1, [kitchen.LETTUCE, kitchen.ONION], is_near)
+    collect(env, actions[:, collector], collector, is_near)
+    if has_counters:
+        hand_over(env, actions[:, 1])
+    return actions
+
+
+def chop(env, actions, cook, board, foods, is_near):
+    """Gets one of the foods after the other, puts it on the board and chops it. Enters its macro-actions, [N]."""
+    chopped = env.strikes == kitchen.STRIKES
+    food = np.where(chopped[:, foods[0]], foods[-1], foods[0])  # [N]
+    is_raw = ~np.take_along_axis(chopped, food[:, None], 1)[:, 0]
+    food_cell = np.take_along_axis(env.cell, food[:, None], 1)[:, 0]
+    is_here = np.take_along_axis(is_near, food[:, None], 1)[:, 0]
+    cook_cell, board_cell = env.cell[:, kitchen.COOK + cook], env.starts[kitchen.BOARD + board]
+    has_nothing = env._held()[:, cook] == kitchen.NOTHING
+    is_beside = cook_cell == board_cell + kitchen.STEP[kitchen.RIGHT]
+    board_is_full = (env.cell[:, : kitchen.BOARD] == board_cell).any(1)
+    for mask, action in (
+        (is_raw & is_here & has_nothing, 1 + food),
+        (is_raw & (food_cell == cook_cell), np.where(board_is_full, kitchen.STAY, kitchen.GO_TO_BOARD + board)),
+        (is_raw & (food_cell == board_cell) & is_beside, kitchen.CHOP),
+    ):
+        np.copyto(actions, action, where=mask)
+
+
+def collect(env, actions, cook, is_near):
+    """Gets plate 0, goes to boards with a chopped vegetable and delivers the salad. Enters its macro-actions, [N]."""
+    held = env._held()[:, cook]
+    has_plate, has_nothing = held == kitchen.PLATE, held == kitchen.NOTHING
+    on_boards = env._thing_in(env.cell[:, kitchen.BOARD : kitchen.DELIVERY])  # [N, boards]
+    to_collect = env._is_chopped(on_boards)
+    is_whole = (env.cell[:, : kitchen.PLATE] == env.cell[:, kitchen.PLATE, None]).all(1)
+    is_idle = actions >= env.first_single_step
+    for mask, action in (
+        (has_nothing & is_idle & is_near[:, kitchen.PLATE], kitchen.GET_PLATE),
+        (has_plate & to_collect.any(1), kitchen.GO_TO_BOARD + to_collect.argmax(1)),
+        (has_plate & is_whole, kitchen.DELIVER),
+    ):
+        np.copyto(actions, action, where=mask)
+
+
+def hand_over(env, actions):
+    """Cook 1 puts the vegetables and plate 0 on the counters in the middle. Enters its macro-actions, [N]."""
+    things = np.array([kitchen.TOMATO, kitchen.LETTUCE, kitchen.PLATE, kitchen.ONION])
+    is_waiting = env.cell[:, things] == env.starts[things]  # at its place of the start
+    has_something = env._held()[:, 1] != kitchen.NOTHING
+    np.copyto(actions, 1 + things[is_waiting.argmax(1)], where=is_waiting.any(1))
+    np.copyto(actions, kitchen.GO_TO_COUNTER, where=has_something)
+
+
 def script_of(env_id):
     """(name, policy, whether it is optimal) of the script for a task."""
     if env_id.startswith("bp"):
         return "both push the big box", push_big_box, True
     if env_id.startswith("wtd"):
         return "fixed loads", partial(deliver, loads=LOADS[env_id.split("-")[1]]), True
+    if env_id.startswith("overcooked"):
+        return "cooks with fixed parts", cook_salad, False
     name = "always towards the target" if env_id.endswith("primitive") else "always Move-to-T"
     return name, go_to_target, False
 

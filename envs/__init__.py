@@ -17,6 +17,7 @@ import gymnasium as gym
 from envs.box_pushing import BoxPushing
 from envs.capture_target import CaptureTarget
 from envs.core import MacroVectorEnv, SingleMacroEnv, TaskError  # noqa: F401, the scripts need TaskError
+from envs.overcooked import Overcooked
 from envs.warehouse import Warehouse
 
 _TASKS = {}  # id: (domain, its keywords, default settings of the scripts)
@@ -198,5 +199,8 @@ register("bp-10-primitive", BoxPushing, grid=10, primitive=True)
 register("wtd-s-primitive", Warehouse, layout="s", primitive=True)
 register("ct-10-primitive", CaptureTarget, n_agents=10, primitive=True)
 register("ct-10-onestep", CaptureTarget, n_agents=10, one_step=True)
+register("overcooked-a", Overcooked, layout="a")
+register("overcooked-b", Overcooked, layout="b")
+register("overcooked-c", Overcooked, layout="c")
 
 IDS = tuple(_TASKS)  # the benchmark's tasks, without those that are registered later

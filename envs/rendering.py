@@ -1,4 +1,4 @@
-"""Pictures of the three domains, drawn with Pillow: a scene, and beside or below it a panel about every agent.
+"""Pictures of the domains, drawn with Pillow: a scene, and beside or below it a panel about every agent.
 
 Lengths and positions are in pixels of the finished picture, and y grows downwards. A `Canvas` draws everything larger
 and reduces it at the end, which smooths the edges.
@@ -12,6 +12,22 @@ from math import ceil, cos, dist, hypot, pi, sin, sqrt
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from envs.overcooked import (
+    BOARD,
+    COLUMN,
+    COOK,
+    COOKS,
+    DELIVERY,
+    LETTUCE,
+    NOTHING,
+    ONION,
+    PLATE,
+    ROW,
+    SIDE,
+    STRIKES,
+    THING_NAMES,
+    TOMATO,
+)
 from envs.warehouse import LAST_PHASE, NO_TOOL, PHASES
 
 ENLARGED = 2  # how many times larger everything is drawn
@@ -68,6 +84,11 @@ TOOLS = [  # corners, relative size and colour of each kind of tool
     (4, 1.15, YELLOW),
     (6, 1.05, SKY),
 ]
+FOODS = {  # colour of a vegetable and of the letter on it, and this letter
+    TOMATO: ("#d1383d", WHITE, "T"),
+    LETTUCE: ("#7cb342", INK, "L"),
+    ONION: ("#f3e3ec", INK, "O"),
+}
 HEADINGS = [  # (dx, dy) in a picture of the orientations of Box Pushing
     (0, -1),  # north
     (1, 0),  # east
@@ -780,3 +801,119 @@ def _arrivals(panel, count, agents):
     panel.text(24, 6, "on the target", colour=MUTED)
     panel.text(PANEL, 6, f"{count} / {agents}", anchor="r")
     _bar(panel, 0, 18, PANEL, 6, count / agents, ALARM)
+
+
+# ---- Overcooked -----------------------------------------------------------------------------------------------------
+def draw_overcooked(env, index):
+    """A picture, uint8 [height, width, 3], of one environment of an `Overcooked` batch."""
+    board = Board(SIDE, HEADER + COOKS * ENTRY + 150)
+    cells = env.cell[index]
+    held = env._held()[index]
+    _counters(board, env)
+    _remembered_targets(board, env, index)
+    for cook in range(COOKS):
+        x, y = _centre(board, cells[COOK + cook])
+        _agent(board.canvas, x, y, board.cell_side * 0.3, cook)
+
+    for cell in np.unique(cells[:BOARD]):
+        things = np.flatnonzero(cells[:BOARD] == cell)
+        x, y = _centre(board, cell)
+        if cell in cells[COOK:]:  # in a hand, upper right of the cook's middle
+            _things(board.canvas.part(x + 22, y - 22, 0.85), things, env.strikes[index])
+        else:
+            _things(board.canvas.part(x, y), things, env.strikes[index])
+
+    notes = []
+    for cook in range(COOKS):
+        note = "holds nothing" if held[cook] == NOTHING else f"holds {THING_NAMES[held[cook]]}"
+        chop_moves = env.chop_moves[index, cook]
+        if chop_moves > 0:
+            note += f", chop moves: {chop_moves}"
+        notes.append(note)
+    panel = board.panel
+    _header(panel, env, index, "Overcooked", f"layout: {env.layout}")
+    _agent_list(panel.part(0, HEADER), env, index, range(COOKS), notes)
+    _salad(panel.part(0, HEADER + COOKS * ENTRY + 30), env.strikes[index])
+    return board.canvas.pixels()
+
+
+def _centre(board, cell):
+    """The middle of a cell of the kitchen."""
+    return board.locate((COLUMN[cell] + 0.5, SIDE - ROW[cell] - 0.5))
+
+
+def _counters(board, env):
+    """Draws the counters, the boards with a knife each, and the delivery counter with a star."""
+    side = board.cell_side
+    for cell in np.flatnonzero(~env.is_floor):
+        x, y = _centre(board, cell)
+        board.canvas.box(x - side / 2, y - side / 2, side, side, WOOD, WOOD_DARK)
+    for cell in env.starts[BOARD:DELIVERY]:
+        x, y = _centre(board, cell)
+        board.canvas.box(x - 0.38 * side, y - 0.38 * side, 0.76 * side, 0.76 * side, PAPER, MUTED, radius=6)
+        board.canvas.line((x - 0.3 * side, y - 0.28 * side), (x - 0.3 * side, y + 0.06 * side), MUTED, thickness=5)
+        board.canvas.line((x - 0.3 * side, y + 0.06 * side), (x - 0.3 * side, y + 0.28 * side), INK, thickness=5)
+    x, y = _centre(board, env.starts[DELIVERY])
+    board.canvas.box(x - side / 2, y - side / 2, side, side, GREEN_PALE, GREEN_DARK)
+    _star(board.canvas, x, y, side * 0.34)
+
+
+def _star(canvas, x, y, radius):
+    """Draws a star around (x, y)."""
+    corners = []
+    for number in range(10):
+        reach = radius if number % 2 == 0 else 0.45 * radius
+        angle = pi * number / 5 - pi / 2
+        corners.append((x + reach * cos(angle), y + reach * sin(angle)))
+    canvas.polygon(corners, YELLOW, GREEN_DARK)
+
+
+def _remembered_targets(board, env, index):
+    """Draws a line from each cook that goes for a thing to the place where it remembers the thing."""
+    for cook in range(COOKS):
+        thing = env.macro_action[index, cook] - 1  # the thing to which a macro-action leads
+        is_running = not env.macro_done[index, cook]
+        if is_running and TOMATO <= thing <= DELIVERY:
+            start = _centre(board, env.cell[index, COOK + cook])
+            goal = _centre(board, env.memory[index, cook, thing])
+            colour, _ = agent_colours(cook)
+            board.canvas.dashes(start, goal, colour)
+
+
+def _things(canvas, things, strikes):
+    """Draws what is in a cell around the origin: a vegetable, or a plate with what is on it."""
+    foods = [thing for thing in things if thing < PLATE]
+    has_plate = len(foods) < len(things)
+    if has_plate:
+        canvas.disc(0, 0, 26, WHITE, SLATE, edge=2)
+        canvas.disc(0, 0, 18, fill=None, outline=LINE)
+    places = [(0, 0), (-11, 0), (11, 0)] if len(foods) < 3 else [(0, -11), (-11, 8), (11, 8)]
+    if len(foods) == 2:
+        places = places[1:]
+    for food, (x, y) in zip(foods, places, strict=False):
+        _food(canvas, x, y, 11 if has_plate else 18, food, strikes[food])
+
+
+def _food(canvas, x, y, radius, food, strikes):
+    """Draws a vegetable, with a cut for each strike that it has got and, when it is chopped, a ring."""
+    colour, letter_colour, letter = FOODS[food]
+    canvas.disc(x, y, radius, colour, INK)
+    for cut in range(2 * strikes):
+        angle = pi * (cut // 2 / STRIKES + 1 / 6 + cut % 2)
+        dx = radius * cos(angle)
+        dy = radius * sin(angle)
+        canvas.line((x + 0.6 * dx, y + 0.6 * dy), (x + dx, y + dy), INK, thickness=radius / 8)
+    if strikes == STRIKES:
+        canvas.disc(x, y, radius * 1.2, fill=None, outline=GREEN, edge=2)
+    canvas.text(x, y, letter, radius, letter_colour, anchor="m", bold=True)
+
+
+def _salad(panel, strikes):
+    """Says how far the vegetables of the salad are chopped."""
+    panel.text(0, 0, "strikes of a vegetable", colour=MUTED)
+    for food in FOODS:
+        entry = panel.part(0, 34 + 36 * food)
+        _food(entry, 13, 0, 13, food, strikes[food])
+        entry.text(36, 0, THING_NAMES[food])
+        _bar(entry, 110, -4, 90, 8, strikes[food] / STRIKES, GREEN)
+        entry.text(PANEL, 0, f"{strikes[food]} / {STRIKES}", anchor="r")

@@ -11,12 +11,12 @@ from gymnasium.utils.env_checker import check_env
 from PIL import ImageColor
 
 import envs
-from envs import rendering
+from envs import overcooked, rendering
 from envs.warehouse import LAYOUTS
 from tests import fonts
 from tests.sync import ROOT
 
-DOMAINS = {"bp-10", "wtd-s", "ct-10"}
+DOMAINS = {"bp-10", "wtd-s", "ct-10", "overcooked-c"}
 CUSTOM = [
     ("bp-10", {"grid": 6}),
     ("bp-10", {"grid": 8, "small_boxes": [(0.5, 2.5), (6.5, 5.5)], "big_box": (4, 3.5)}),
@@ -144,6 +144,13 @@ SEEN = {
         *PANEL,
         *[("position", (0, 9, 0), 1), ("target", (0, 1), 8), ("visible", (0, 4), False), ("goal", (0, 3, 1), 2)],
     ],
+    "overcooked-c": [
+        *PANEL,
+        *[("cell", (0, overcooked.COOK), 22), ("cell", (0, overcooked.TOMATO), 20)],
+        *[("cell", (0, overcooked.ONION), 9), ("cell", (0, overcooked.LETTUCE), 41)],  # in a hand, on a plate
+        *[("cell", (0, overcooked.PLATE), 7), ("memory", (0, 0, overcooked.TOMATO), 24)],
+        *[("strikes", (0, 1), 1), ("strikes", (0, 2), 3), ("chop_moves", (0, 1), 2)],
+    ],
 }
 
 
@@ -160,6 +167,8 @@ def busy(env_id):
         env.arm_left[:], env.staged[:] = 3, 1
     if env_id == "ct-10":
         env.position[:], env.target[:], env.goal[:], env.visible[:] = 4, 6, 6, True
+    if env_id == "overcooked-c":
+        env.macro_action[0, 0] = overcooked.GET_FOOD
     return env
 
 
@@ -183,7 +192,7 @@ def test_every_array_of_the_simulator_is_among_those_tested():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env_id", envs.IDS)
+@pytest.mark.parametrize("env_id", [env_id for env_id in envs.IDS if not env_id.startswith("overcooked")])
 def test_agents_on_one_spot_are_all_visible(env_id):
     env = started(env_id)
     env.position[:] = env.position[:, :1]
@@ -298,3 +307,21 @@ def test_ascii_is_drawn_without_matplotlib():
     code = "import sys, envs; envs.make('ct-10')._draw(0); print('matplotlib' in sys.modules)"
     program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert program.stdout == "False\n", program.stderr
+
+
+def test_what_is_held_is_at_its_cook_and_what_is_on_a_plate_on_it():
+    env = started("overcooked-a")
+    kitchen = picture(env)[:, :580]
+    side, margin = 80, rendering.MARGIN
+
+    def of_cell(frame, cell):
+        top, left = margin + side * overcooked.ROW[cell], margin + side * overcooked.COLUMN[cell]
+        return frame[top : top + side, left : left + side]
+
+    plate, tomato = env.starts[overcooked.PLATE], env.starts[overcooked.TOMATO]
+    red, _, _ = rendering.FOODS[overcooked.TOMATO]
+    for cell in (plate, env.starts[overcooked.COOK]):
+        assert pixels_of(of_cell(kitchen, cell), red) == 0
+        env.cell[0, overcooked.TOMATO] = cell
+        moved = picture(env)[:, :580]
+        assert pixels_of(of_cell(moved, cell), red) > 50 and pixels_of(of_cell(moved, tomato), red) == 0

@@ -8,10 +8,15 @@ import pytest
 import envs
 
 HERE = Path(__file__).parent
-FOLDERS = (HERE.parents[1] / "shared" / "traces", HERE / "traces")  # all seven, and the two small ones kept here
+FOLDERS = (HERE.parents[1] / "shared" / "traces", HERE / "traces")  # all ten, and three small ones kept here
 
 
-@pytest.mark.parametrize("env_id", ["bp-10", "bp-20", "bp-30", "wtd-s", "wtd-d", "wtd-t", "wtd-t1"])
+BOX_PUSHING = ["bp-10", "bp-20", "bp-30"]
+WAREHOUSE = ["wtd-s", "wtd-d", "wtd-t", "wtd-t1"]
+OVERCOOKED = ["overcooked-a", "overcooked-b", "overcooked-c"]
+
+
+@pytest.mark.parametrize("env_id", BOX_PUSHING + WAREHOUSE + OVERCOOKED)
 def test_recorded_episodes(env_id):
     path = next((folder / f"{env_id}.npz" for folder in FOLDERS if (folder / f"{env_id}.npz").exists()), None)
     if path is None:
@@ -28,6 +33,7 @@ def test_recorded_episodes(env_id):
         # An episode that is over is reset and given anything: agents that are free in the recording may not be here.
         actions = np.where(live[:, None], trace["action"][:, t], 0).astype(int)
         obs, rewards, terminations, truncations, infos = env.step(actions)
+        rewards = rewards.astype(trace["reward"].dtype)  # some recordings have float32
         np.testing.assert_array_equal(rewards[live], trace["reward"][live, t])
         np.testing.assert_array_equal(terminations[live], trace["terminated"][live, t])
         np.testing.assert_array_equal(truncations[live], (last & ~trace["terminated"][:, t])[live])
