@@ -363,6 +363,7 @@ def test_what_busy_agents_add_with_the_mixers(script, mask_ongoing):
 # ---- training -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "env_id", "options"),
     [

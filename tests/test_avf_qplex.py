@@ -696,6 +696,7 @@ def test_the_learning_rate_may_be_constant(tmp_path, matrix_game, adam):
     assert adam.rates == [3e-4] * 5
 
 
+@pytest.mark.slow
 @every_q_learner
 @pytest.mark.parametrize(
     ("learning_starts", "train_frequency", "steps"),

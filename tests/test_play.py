@@ -301,6 +301,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(run):
     assert program.stderr.read() == "" and program.wait() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", play.SCRIPTS)
 def test_every_script_can_be_watched(name, tmp_path, brief, capsys):
     folder = train(name, "bp-10", tmp_path, total_timesteps=600)
@@ -533,6 +534,7 @@ def test_a_model_that_lacks_a_part_ends_with_one_line(run, tmp_path, refused):
         refused("best.pt is damaged, or not the model of a script")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [None, [], "text", -1, 2.5, 10**30, float("inf"), {"a": 1}])
 def test_whatever_a_setting_is_there_is_a_line_or_it_plays(run, edit, tmp_path, brief, capsys, value):
     """Few settings matter to a model that is watched. No value of any of them gives a traceback."""
@@ -631,6 +633,7 @@ def test_a_timeline_that_is_too_long_needs_steps(run, tmp_path, brief, monkeypat
     play.main([*command, "--steps=1-12"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["team.gif", "team.png", "team.svg", "team.pdf"])
 def test_a_full_disk_ends_with_one_line_and_leaves_nothing(run, tmp_path, brief, name):
     """Here files may have 1,000 bytes at most."""

@@ -55,6 +55,7 @@ def pixels_of(frame, colour):
     return np.count_nonzero((frame == ImageColor.getrgb(colour)).all(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", envs.IDS)
 def test_the_frames_of_an_episode_have_one_size_and_show_something_new(env_id):
     env = started(env_id)
@@ -172,6 +173,7 @@ def busy(env_id):
     return env
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env_id", "name", "where", "value"),
     [(env_id, *change) for env_id, changes in SEEN.items() for change in changes],

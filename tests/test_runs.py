@@ -473,6 +473,7 @@ def test_tasks_have_the_values_of_the_family_in_which_they_are(script):
     assert given == module.Args(**{"env": "ct-10", **module.DEFAULTS["ct-"], "gamma": 0.5, "anneal_lr": False})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_help_says_what_each_setting_does_and_its_value_for_the_task(script, capsys):
     """The text of a setting is the comment behind it."""
@@ -703,6 +704,7 @@ envs.register("spoiled", Spoiled, grid=6)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_task_of_the_current_folder_that_goes_wrong_ends_the_run_in_one_line(tmp_path, monkeypatch, script):
     """The module is found there. The line names the environment and the step, and the last good model is kept."""

@@ -92,6 +92,7 @@ def test_always_move_to_target():
     assert np.array_equal(result["return"], result["success"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", envs.IDS)
 def test_references_are_those_of_the_code(env_id):
     entry = REFERENCES[env_id]

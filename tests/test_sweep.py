@@ -294,6 +294,7 @@ def test_a_value_of_another_family_leaves_the_checksum(tmp_path, monkeypatch):
 TASKS = ["bp-10", "wtd-s", "ct-10", "own:x"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file, edit, changes",
     [
@@ -378,6 +379,7 @@ def test_dry_run_writes_nothing(place, capsys):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"total_timesteps": "many"}'])
 def test_a_run_that_was_killed_while_it_began_is_begun_again(place, capsys, text):
     """It has no checkpoint, and an args.json that is cut short."""
@@ -400,6 +402,7 @@ def test_a_crash_is_retried_once_from_the_checkpoint(place, capsys):
     assert f"--resume={run_folders(place)[0]}" in logs(place)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how, code", [("Ctrl-C", 130), (signal.SIGTERM, -15), (signal.SIGKILL, -9)])
 def test_a_script_that_somebody_else_stops_is_not_tried_again(place, capsys, how, code):
     """Nor has it failed: the next call of the same command goes on with it."""

@@ -223,6 +223,7 @@ def test_no_text_covers_another_or_leaves_the_picture(env_id, steps):
     assert [int(text.get_text()) for text in at_rows if text.get_text().isdigit()] == numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [None, (0, 1)])
 def test_odd_episodes_can_be_read(episode, steps):
     one_step = episode._replace(chosen=episode.chosen[:1], running=episode.running[:1], rewards=episode.rewards[:1])
@@ -253,6 +254,7 @@ def test_abbreviations_of_one_agents_macro_actions_differ():
 ODD = ["-1", "Wait-", "", "A--B", "$x^$ costs $5", "Иди-к-двери(0)", "去工作室", "去-工(0)"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [None, (0, 40), (3, 8)])
 def test_odd_names_and_other_scripts_are_drawn_and_cover_nothing(steps, tmp_path, recwarn):
     episode = random_episode("bp-10")._replace(names=[ODD, ODD])

@@ -333,6 +333,7 @@ def test_bad_input_is_refused(change):
 
 
 # ---- the degenerate case --------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @ties_of_every_kind
 @MANY
 @given(table=tables(), data=st.data())
@@ -356,6 +357,7 @@ def test_all_busy_is_no_demand(ties, table, data):
 
 
 # ---- Prop. 3.4 ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @ties_of_every_kind
 @MANY
 @given(table=tables(), data=st.data())
@@ -406,6 +408,7 @@ def without_disadvantage(q, utilities, available, value=None, values=None):
     return jointly, locally
 
 
+@pytest.mark.slow
 @ties_of_every_kind
 @MANY
 @given(table=tables(), data=st.data())
@@ -671,6 +674,7 @@ def test_mac_igm_for_every_m_minus_is_not_enough_for_initiation_sets():
 
 
 # ---- many tables at once --------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @ties_of_every_kind
 @SOME
 @given(table=tables(max_agents=3, max_actions=4), data=st.data())

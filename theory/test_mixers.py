@@ -174,6 +174,7 @@ def test_mac_igm_at_any_weights(name, data):
     assert (relative_loss(q, utilities, available) <= TOLERANCE).all()
 
 
+@pytest.mark.slow
 @every_consistent_mixer
 @of_many_sizes
 def test_mac_igm_on_many_tables(name, sizes):
