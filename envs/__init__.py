@@ -20,15 +20,16 @@ from envs.core import MacroVectorEnv, SingleMacroEnv, TaskError  # noqa: F401, t
 from envs.overcooked import Overcooked
 from envs.warehouse import Warehouse
 
-_TASKS = {}  # id: (domain, its keywords, default settings of the scripts)
+_TASKS = {}  # id: (domain, its constructor keywords, default settings of the training scripts)
 
 
 def register(env_id, domain, defaults=None, **kwargs):
-    """Makes a task known to `make`, to `--env` of the scripts and, as `env_id` + "-v0", to Gymnasium.
+    """Makes a task known to `make`, to `--env` of the training scripts and, as `env_id` + "-v0", to Gymnasium.
 
-    `make("module:id")` imports the module first, so a task may be registered in a file of its own. The definition of a
-    domain may be registered again, with the same keywords or others: Gymnasium warns, and the new one replaces the old
-    one. So a module can be reloaded, and a file that registers a task can run as a script that uses it.
+    `make("module:id")` imports the module first, so a task may be registered in a file of its own. An id may be
+    registered again if the domain is the same class of the same file. The keywords may be others. Gymnasium warns, and
+    the new task replaces the old one. This lets a module be reloaded. It also lets a file that registers a task run as
+    a script and be imported as a module by `make("module:id")` in the same process.
 
     Gymnasium's spec names the domain's module and class, so that another process can make the task. A class of the main
     module, or one that is defined in a function, has no such name: then `EnvSpec.to_json` raises an error.
@@ -40,7 +41,8 @@ def register(env_id, domain, defaults=None, **kwargs):
             setting that a script does not have is ignored by it.
 
     Raises:
-        ValueError: the id has other characters, or it is one of `IDS` or that of a task of another domain.
+        ValueError: the id has other characters, or it is one of `IDS`, the tasks registered at the end of this file, or
+            that of a task of another domain.
     """
     if not isinstance(env_id, str) or not re.fullmatch(r"\w+([.-]+\w+)*", env_id):
         raise ValueError(f"an id must be of letters, digits and '_', with '-' and '.' between them, got {env_id!r}")
@@ -48,13 +50,14 @@ def register(env_id, domain, defaults=None, **kwargs):
         known, _, _ = _TASKS[env_id]
         if env_id in IDS or _definition(known) != _definition(domain):
             raise ValueError(f"there is an environment {env_id!r} already, of {_path(known)}")
-    single = "envs:make_single"
-    batch = "envs:make_batch"
-    spec_kwargs = {"env_id": env_id, "domain": _path(domain), **kwargs}
-    if not _is_importable(domain):
+    spec_kwargs = {"env_id": env_id, **kwargs}
+    if _is_importable(domain):
+        single = "envs:make_single"
+        batch = "envs:make_batch"
+        spec_kwargs["domain"] = _path(domain)
+    else:
         single = functools.partial(make_single, domain=domain)
         batch = functools.partial(make_batch, domain=domain)
-        del spec_kwargs["domain"]
     gym.register(f"{env_id}-v0", single, vector_entry_point=batch, kwargs=spec_kwargs)
     _TASKS[env_id] = domain, kwargs, defaults or {}
 
@@ -65,7 +68,11 @@ def _path(domain):
 
 
 def _definition(domain):
-    """Where a domain is defined: file and name. A file that runs as a script is the module `__main__`, too."""
+    """Where a domain is defined: file and name.
+
+    Not the module and name, because a file that runs as a script is the module `__main__` and can be imported under its
+    own name, too.
+    """
     module = sys.modules.get(domain.__module__)
     return getattr(module, "__file__", domain.__module__), domain.__qualname__
 
@@ -122,7 +129,7 @@ def problem(env_id):
 def defaults(env_id, args_class):
     """Settings that a task was registered with, {name: value}, without those that a script's `Args` does not have.
 
-    They are none for an id that `make` does not know.
+    The dict is empty for an id that `make` does not know.
     """
     try:
         _, _, settings = _find(env_id)
@@ -144,8 +151,8 @@ def make(env_id, num_envs=1, **kwargs) -> MacroVectorEnv:
         TypeError: the domain has no such keyword.
         ImportError: the module cannot be imported.
     """
-    domain, task, _ = _find(env_id)
-    return domain(num_envs=num_envs, **{**task, **kwargs})
+    domain, task_kwargs, _ = _find(env_id)
+    return domain(num_envs=num_envs, **{**task_kwargs, **kwargs})
 
 
 def make_batch(num_envs, env_id, domain, max_episode_steps=None, **kwargs) -> MacroVectorEnv:
@@ -160,7 +167,7 @@ def make_batch(num_envs, env_id, domain, max_episode_steps=None, **kwargs) -> Ma
     """
     if isinstance(domain, str):
         module, _, name = domain.partition(":")
-        domain = operator.attrgetter(name)(_import(module))
+        domain = operator.attrgetter(name)(_import(module))  # a name may have dots: Outer.Domain
     env = domain(num_envs=num_envs, **kwargs)
     if max_episode_steps not in (None, env.horizon):
         raise ValueError(f"{env_id} ends after its horizon, {env.horizon} steps, not after {max_episode_steps}")
@@ -174,7 +181,8 @@ def make_single(env_id, domain, **kwargs) -> SingleMacroEnv:
     return SingleMacroEnv(make_batch(1, env_id, domain, **kwargs))
 
 
-make_single.metadata = SingleMacroEnv.metadata  # Gymnasium makes "human" and "rgb_array_list" of these render modes
+# gymnasium.make reads the render modes from the entry point. From "rgb_array" it makes "human" and "rgb_array_list".
+make_single.metadata = SingleMacroEnv.metadata
 
 
 def to_pettingzoo(env_id, **kwargs):

@@ -12,7 +12,10 @@ from envs import checks
 
 
 class TaskError(ValueError):
-    """What a domain says of its task cannot be: another shape, a number that is not finite, an empty initiation set."""
+    """A domain returned something invalid.
+
+    It is an array of a wrong shape or dtype, a number that is not finite, or an empty initiation set.
+    """
 
 
 class MacroVectorEnv(VectorEnv, ABC):
@@ -49,7 +52,7 @@ class MacroVectorEnv(VectorEnv, ABC):
     A domain calls `super().__init__` and implements `_reset`, `_advance`, `_observe`, `_state` and `_draw`. If its
     macro-actions have initiation sets, it overrides `_can_start`. It names the arrays that hold its simulator state in
     `sim_arrays`; the first axis of each is the environment. What these methods return is checked in every step and
-    reset: another shape or dtype, or a number that is not finite, raises a ValueError.
+    reset: another shape or dtype, or a number that is not finite, raises a TaskError.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8, "autoreset_mode": AutoresetMode.DISABLED}
@@ -88,8 +91,8 @@ class MacroVectorEnv(VectorEnv, ABC):
         self.single_action_space = gym.spaces.MultiDiscrete(self.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._numbers = np.arange(max(self.n_actions))  # of the macro-actions of an agent that has A
-        self.own_actions = self._numbers < np.array(self.n_actions)[:, None]
+        self._action_index = np.arange(max(self.n_actions))  # [A]
+        self.own_actions = self._action_index < np.array(self.n_actions)[:, None]
         self._own_everywhere = np.broadcast_to(self.own_actions, (num_envs, *self.own_actions.shape))  # read-only
         self._env_index = np.arange(num_envs)[:, None]
         self._agent_index = np.arange(self.n_agents)
@@ -126,7 +129,11 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     @abstractmethod
     def _observe(self, start):
-        """Macro-observations float32 [N, n, d] of the current simulator state; start: whether this is a reset."""
+        """Macro-observations float32 [N, n, d] of the current simulator state.
+
+        Args:
+            start: True in a reset, False in a step. In a reset only the environments that were reset use the result.
+        """
 
     @abstractmethod
     def _state(self):
@@ -140,7 +147,10 @@ class MacroVectorEnv(VectorEnv, ABC):
         return self._own_everywhere
 
     def _restore(self):
-        """Called by `load_state` after the arrays are set. A domain that holds more than arrays makes it from them."""
+        """Called by `load_state` after the arrays are set.
+
+        A domain whose simulator state is not only in `sim_arrays` rebuilds the rest from them here.
+        """
 
     @abstractmethod
     def _draw(self, index):
@@ -225,7 +235,7 @@ class MacroVectorEnv(VectorEnv, ABC):
         self._checked("_advance: ended", ended, bool, self.macro_done.shape)
         self._checked("_advance: success", success, bool, self.elapsed.shape)
         self._checked("cut", self.cut, bool, self.elapsed.shape)
-        self.success = success.copy()  # a later reset writes into it, and a domain may return one array for both
+        self.success = success.copy()  # a reset writes into it, and it may be the same array as `terminations`
         truncations = (self.cut | (self.elapsed >= self.horizon)) & ~terminations
         self.over = terminations | truncations
         self.macro_done = ended | self.over[:, None]
@@ -243,7 +253,7 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     def _check_free_agents(self, actions):
         """Raises ValueError for the first free agent that is given a macro-action which it cannot start."""
-        in_range = (actions >= 0) & (actions < len(self._numbers))
+        in_range = (actions >= 0) & (actions < len(self._action_index))
         index = np.where(in_range, actions, 0)
         is_available = self.available[self._env_index, self._agent_index, index]  # [N, n]
         bad = self.macro_done & ~(in_range & is_available)
@@ -263,7 +273,7 @@ class MacroVectorEnv(VectorEnv, ABC):
 
     def _update_available(self):
         """Sets `available`: for a free agent its initiation set, for a busy one only its running macro-action."""
-        is_running = self.macro_action[:, :, None] == self._numbers  # [N, n, A]
+        is_running = self.macro_action[:, :, None] == self._action_index  # [N, n, A]
         self.available = np.where(self.macro_done[:, :, None], self._initiation_sets(), is_running)
 
     def _initiation_sets(self):
@@ -278,7 +288,8 @@ class MacroVectorEnv(VectorEnv, ABC):
         if is_stuck.any():
             env, agent = np.argwhere(is_stuck)[0]
             raise TaskError(f"agent {agent} of environment {env} is free, but its initiation set is empty")
-        # Nobody chooses in an episode that is over. An empty set is filled there, so that one can mask with it.
+        # A set may be empty where an agent is busy or its episode is over: nobody chooses there. It becomes all that
+        # the agent has, so that an argmax or softmax over `available` is defined after the end of an episode, too.
         return can_start | (is_empty[:, :, None] & self.own_actions)
 
     def _checked(self, name, array, dtype, shape):
@@ -344,8 +355,10 @@ class SingleMacroEnv(gym.Env):
     """One environment of a domain as a `gymnasium.Env`: a batch of one, without the batch's axis.
 
     `obs` is float32 [n, d] and the reward a float. The info has the entries of `MacroVectorEnv.step`: arrays, but
-    `success` is a bool. `reset` takes the options of the batch. `spec.max_episode_steps` is the horizon. The batch
-    truncates by itself, so Gymnasium adds no `TimeLimit`.
+    `success` is a bool. `reset` takes the options of the batch.
+
+    The batch truncates by itself, so tasks are registered without a step limit and `gymnasium.make` of an id adds no
+    `TimeLimit`. The `spec` of the environment that was made has the horizon as its `max_episode_steps`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
@@ -362,7 +375,7 @@ class SingleMacroEnv(gym.Env):
         return self._spec
 
     @spec.setter
-    def spec(self, spec):  # Gymnasium sets it
+    def spec(self, spec):  # gymnasium.make sets it, without a step limit
         spec.max_episode_steps = self.vector_env.horizon
         self._spec = spec
 
