@@ -9,7 +9,8 @@ import numpy as np
 from envs import checks
 from envs.core import MacroVectorEnv
 
-# Things have numbers, and those of a kind follow each other. The number of a kind is that of its first thing.
+# Things have numbers, and those of one kind follow each other. A kind has the number of its first thing: things 3 and 4
+# are of the kind PLATE, 3.
 TOMATO, LETTUCE, ONION = range(3)
 PLATE = 3  # and 4
 BOARD = 5  # and 6
@@ -97,7 +98,7 @@ GO_TO_BOARD = 6  # and 7
 DELIVER = 8
 CHOP = 9
 GO_TO_COUNTER = 10  # only in layouts with counters in the middle
-SINGLE_STEPS = ["Right", "Down", "Left", "Up"]  # the last macro-actions
+SINGLE_STEPS = ["Right", "Down", "Left", "Up"]  # the last macro-actions, in the order of the moves
 
 COOKS = 3
 FOODS = 3
@@ -108,16 +109,17 @@ DISHES = 7  # of the published code; the last of them is asked for
 class Node(NamedTuple):
     """A cell that the search for a way has reached."""
 
-    length: int  # of the way to here, and on to the target if nothing is in between
+    length: int  # steps to here plus the distance from here to the target
     meets_cook: bool  # whether a cook is here
-    steps: int  # of the way to here
+    steps: int  # from the start to here
     cell: int
-    first: int  # move of the way
+    first: int  # the first move of the way to here
 
     def __lt__(self, other):
-        """Which one a heap gives out first. It also holds of two that are equal here, as in the published code.
+        """Whether a heap may give this node out before the other one. It compares `length`, then `meets_cook`.
 
-        So the order of `heapq` decides between them, and the cooks of the published code take the same way.
+        Of two nodes that are equal in both, each is "less" than the other. The published code compares in the same way,
+        so `heapq` breaks ties as it does there.
         """
         return self[:2] <= other[:2]
 
@@ -162,7 +164,8 @@ class Overcooked(MacroVectorEnv):
 
     A cook sees what is within two rows and two columns of its own cell. It goes to where it saw a thing last: each cook
     remembers the place of each thing, at first that of the start. If it sees the remembered place and the thing is not
-    there, it believes from then on that the thing is at its place of the start, even if it sees that it is not.
+    there, it believes from then on that the thing is at its place of the start, even if it sees that the thing is not
+    there either.
 
     Each step, in this order:
 
@@ -176,8 +179,8 @@ class Overcooked(MacroVectorEnv):
           things is a plate and the other one a chopped vegetable, the vegetable goes on the plate: on the counter if
           the cook holds the vegetable, in its hand if it holds the plate.
         - A board: a cook that holds nothing strikes an unchopped vegetable once, and takes anything else. A cook that
-          holds something puts it on an empty board. If one of them has a plate and the other one a chopped vegetable,
-          the vegetable goes on the plate, and the cook holds it then.
+          holds something puts it on an empty board. If the cook holds a plate and a chopped vegetable is on the board,
+          or the other way round, the vegetable goes on the plate, and the cook holds the plate then.
         - The delivery counter: a cook delivers what it holds. If this is not the right dish, the thing and what is on
           it are at their places of the start again, unchopped. Chopping them pays again.
         - Any other counter: a cook puts down what it holds.
@@ -197,16 +200,17 @@ class Overcooked(MacroVectorEnv):
           the board that is its target; Get-... and the thing is not where the cook remembers it.
         - If the cook holds a chopped vegetable, Get-Plate does not end with this move, which puts the vegetable on the
           plate. The next one takes the plate.
-        - It ends without a move if there is no way and, with the target in view, if the cook believes a cook to be in
-          its cell, be it itself, or if a plate is there and it is Get-(a vegetable).
-        - It ends after a move if the thing of Get-... is not where the cook remembers it, even if the cook cannot know
-          this. Beside the target, Get-(a vegetable) ends if this is an unchopped vegetable on a board, and Go-to-Board
-          and Deliver end if the cook holds nothing.
-        - A cook makes room: it moves right instead if it believes a cook to be beside board 1 and it is beside board 0
-          with Deliver, or beside the delivery counter with board 0 as its target.
+        - It ends without a move if there is no way. If the cook has the target in view, it also ends without a move in
+          two cases: the cook believes that a cook, possibly itself, is in the target's cell; a plate is in the target's
+          cell and the macro-action is Get-(a vegetable).
+        - After all moves of a step it ends if the thing of Get-... is not where the cook remembers it, even if the cook
+          cannot know this. If the cook is beside its target then, Get-(a vegetable) also ends if an unchopped vegetable
+          is on the board that is its target, and Go-to-Board and Deliver also end if the cook holds nothing.
+        - A cook makes room for a cook that it believes to be beside board 1: it moves right instead of towards its
+          target. It does so beside board 0 with Deliver, and beside the delivery counter with board 0 as its target.
     - 9 Chop: the cook moves towards the board beside it, and strikes what is there. It ends without a move if there is
-      no unchopped vegetable on a board beside it. It ends with the third move. The count of moves outlives a Chop that
-      ends early, and the moves of a cook that holds something, which cannot strike, count, too.
+      no unchopped vegetable on a board beside it. It ends with the third move. If a Chop ends earlier, the cook's next
+      Chop goes on with its count of moves. A cook that holds something cannot strike, but its moves count, too.
     - 10 Go-to-Counter, in "b" and "c" only: the cook goes to the counter of column 3 that it believes to be empty, of
       several the nearest to row 3. It ends with the move that leads into the counter, or without a move if there is no
       such counter. It goes on without a move while there is no way.
@@ -318,7 +322,8 @@ class Overcooked(MacroVectorEnv):
         """Sets where everything is at the start, and the counters of column 3, the nearest to row 3 first."""
         symbols = "".join(LAYOUTS[layout])
         kinds = np.array([SYMBOLS[symbol] for symbol in symbols])  # [cells]
-        self.starts = np.argsort(kinds, kind="stable")[:THINGS]  # the cell of each thing
+        cells_by_kind = np.argsort(kinds, kind="stable")  # "stable": row by row within a kind
+        self.starts = cells_by_kind[:THINGS]  # the cell of each thing; counters and floor come after the things
         self.is_floor = (kinds == FLOOR) | (kinds == COOK)  # [cells]
         is_inside = (ROW > 0) & (ROW < SIDE - 1)
         counters = np.flatnonzero(~self.is_floor & is_inside & (COLUMN == 3))
@@ -336,14 +341,15 @@ class Overcooked(MacroVectorEnv):
         rewards = np.full(self.num_envs, self.step_cost)
         success = np.zeros(self.num_envs, bool)
         to_move = np.ones(moves.shape, bool)
-        while to_move.any():  # a cook may have to wait until another one has moved
+        # A cook may have to wait until another one has moved. Three cooks on a grid cannot wait in a circle.
+        while to_move.any():
             for cook in np.flatnonzero(to_move.any(axis=0)):
                 reward, is_right = self._move(cook, moves, to_move)
                 rewards += reward
                 success |= is_right
         self._look_around()
-        ended |= self._has_nothing_left_to_do()
-        return rewards, success, ended, success
+        ended |= self._ends_after_moves()
+        return rewards, success, ended, success  # success terminates the episode
 
     # ---- what the macro-actions do ------------------------------------------------------------------------------
     def _choose_moves(self):
@@ -370,38 +376,43 @@ class Overcooked(MacroVectorEnv):
         return steps
 
     def _chop(self, moves):
-        """Chop. The boards are at the left wall, so a cook that is beside a board has it on its left."""
+        """Chop. The boards are at the left wall, so a cook that is beside a board has it on its left.
+
+        A cook that holds something goes on, too: its move is counted here, though it will not be a strike.
+        """
         chops = self.macro_action == CHOP
         left = self._cook_cells() + STEP[LEFT]
-        strikes = chops & self._is_raw_on_board(left)
-        moves[strikes] = LEFT
-        self.chop_moves[strikes] += 1
+        goes_on = chops & self._is_raw_on_board(left)
+        moves[goes_on] = LEFT
+        self.chop_moves[goes_on] += 1
         is_last = self.chop_moves == STRIKES
         self.chop_moves[is_last] = 0
-        return chops & (is_last | ~strikes)
+        return chops & (is_last | ~goes_on)
 
     def _go(self, moves, believed):
         """Get-..., Go-to-... and Deliver."""
         own = self._cook_cells()
         to_thing = (self.macro_action > STAY) & (self.macro_action <= DELIVER)
-        to_counter = (self.macro_action == GO_TO_COUNTER) & (GO_TO_COUNTER < self.first_single_step)
-        counter = self._free_counter(believed)
-        target = np.where(to_counter, counter, self._remembered_target())
+        has_counters = self.middle_counters.size > 0  # without them the number of Go-to-Counter is that of Right
+        to_counter = (self.macro_action == GO_TO_COUNTER) & has_counters
+        target = np.where(to_counter, self._free_counter(believed), self._remembered_target())
 
+        # Who does not walk, and why. Where the target is NOTHING, `no_counter` is all that counts.
+        no_counter = to_counter & (target == NOTHING)
         sees_target = IN_VIEW[own, target]
-        on_plate = self._gets_food() & sees_target & self._is_plate_at(target)
-        occupied = to_thing & sees_target & (_kind_at(believed, target) == COOK)
-        nowhere = to_counter & (counter == NOTHING)
-        makes_room = to_thing & ~on_plate & self._makes_room(target, believed)
-        walks = (to_thing | to_counter) & ~(on_plate | occupied | nowhere | makes_room)
+        plate_is_there = self._gets_food() & sees_target & self._is_plate_at(target)
+        cook_is_there = to_thing & sees_target & (_kind_at(believed, target) == COOK)
+        makes_room = to_thing & ~(plate_is_there | cook_is_there) & self._makes_room(target, believed)
+
+        walks = (to_thing | to_counter) & ~(no_counter | plate_is_there | cook_is_there | makes_room)
         moves[makes_room] = RIGHT
         moves[walks] = _first_moves(own[walks], target[walks], believed[walks])
+        cannot_go = to_thing & (moves == WAIT)  # a plate or a cook is there, or there is no way
 
-        cannot_go = to_thing & (moves == WAIT)
-        arrives = walks & (DISTANCE[own, target] == 1)
+        arrives = walks & (DISTANCE[own, target] == 1)  # the move leads into the target
         plates_food = arrives & self._gets_plate() & self._is_chopped(self._held())
-        moves[arrives & self._does_nothing_at(target)] = WAIT
-        return cannot_go | nowhere | (arrives & ~plates_food)
+        moves[arrives & self._skips_last_move(target)] = WAIT
+        return cannot_go | no_counter | (arrives & ~plates_food)
 
     def _free_counter(self, believed):
         """The counter to which Go-to-Counter leads, NOTHING if there is none, int [N, cooks]."""
@@ -420,15 +431,15 @@ class Overcooked(MacroVectorEnv):
         comes_to_board = (own == beside_delivery) & (target == self.starts[BOARD])
         return meets & (leaves_board | comes_to_board)
 
-    def _does_nothing_at(self, target):
-        """Whether a cook beside its target does not make its last move, bool [N, cooks]."""
+    def _skips_last_move(self, target):
+        """Whether a cook that is beside its target leaves out its last move, bool [N, cooks]."""
         plate_for_raw = self._gets_plate() & self._is_raw(self._held())
         board_for_nothing = self._goes_to_board() & (self._held() == NOTHING)
         to_be_chopped = self._gets_food() & self._is_raw_on_board(target)
         return plate_for_raw | board_for_nothing | to_be_chopped | self._is_wrong_about_target()
 
-    def _has_nothing_left_to_do(self):
-        """Whether a cook's macro-action ends because of what the cook sees after the moves, bool [N, cooks]."""
+    def _ends_after_moves(self):
+        """Whether a cook's macro-action ends because of where things are after the moves, bool [N, cooks]."""
         target = self._remembered_target()
         is_beside = DISTANCE[self._cook_cells(), target] == 1
         brings_something = self._goes_to_board() | (self.macro_action == DELIVER)
@@ -450,11 +461,11 @@ class Overcooked(MacroVectorEnv):
         """
         acts = self._meet(cook, moves, to_move)
         own = self.cell[:, COOK + cook].copy()
-        front = own + STEP[moves[:, cook]]  # without a move its own cell, to which it "walks" then
-        things = self._thing_in(np.column_stack([own, front]))
+        front = own + STEP[moves[:, cook]]  # its own cell if it has no move; "walking" there changes nothing
+        things = self._thing_in(np.column_stack([own, front]))  # [N, 2]: what it holds, and what is in front
         held, thing = things.T
         held_is_chopped, thing_is_chopped = self._is_chopped(things).T
-        thing_is_raw = self._is_raw(things)[:, 1]
+        _, thing_is_raw = self._is_raw(things).T
         to_floor = self.is_floor[front]
         to_board = self._is_board(front)
         to_delivery = front == self.starts[DELIVERY]
@@ -467,7 +478,8 @@ class Overcooked(MacroVectorEnv):
         fills_held_plate = works & _is_plate(held) & thing_is_chopped
         fills_other_plate = works & held_is_chopped & _is_plate(thing)
         delivers = works & (held != NOTHING) & to_delivery
-        has_whole_dish = _is_plate(held) & (self.cell[:, :PLATE] == own[:, None]).all(axis=1)
+        has_all_foods = (self.cell[:, :PLATE] == own[:, None]).all(axis=1)
+        has_whole_dish = _is_plate(held) & has_all_foods  # what is on a plate is chopped
         is_right = delivers & has_whole_dish
         is_wrong = delivers & ~has_whole_dish
 
@@ -476,7 +488,8 @@ class Overcooked(MacroVectorEnv):
         self.cell[walks, COOK + cook] = front[walks]
         self._return_to_start(is_wrong, own)
         self.strikes[chops, thing[chops]] += 1
-        is_done = chops & (self._strikes_of(things)[:, 1] == STRIKES)
+        _, thing_is_chopped_now = self._is_chopped(things).T
+        is_done = chops & thing_is_chopped_now
 
         rewards = np.where(is_done, self.chop_reward, 0.0)
         rewards += np.where(is_right, self.delivery_reward, 0.0)
@@ -484,9 +497,10 @@ class Overcooked(MacroVectorEnv):
         return rewards, is_right
 
     def _meet(self, cook, moves, to_move):
-        """Two cooks whose moves lead to each other's cells swap; returns where the cook goes on with its move now.
+        """Swaps two cooks whose moves lead to each other's cells, and lets a cook wait for another one.
 
-        The arguments are those of `_move`.
+        The arguments are those of `_move`. Returns bool [N]: whether the cook still has to do its move now, because it
+        had not moved yet and its move does not lead to another cook.
         """
         acts = to_move[:, cook].copy()
         to_move[:, cook] = False
@@ -528,9 +542,9 @@ class Overcooked(MacroVectorEnv):
     def _look_around(self):
         """Sets each cook's memory after the moves."""
         sees = self._sees()
-        sees_its_place = IN_VIEW[self._cook_cells()[:, :, None], self.memory]
-        believed = np.where(sees_its_place, self.starts, self.memory)
-        self.memory = np.where(sees, self.cell[:, None], believed)
+        sees_its_place = IN_VIEW[self._cook_cells()[:, :, None], self.memory]  # the place that it remembers
+        unless_seen = np.where(sees_its_place, self.starts, self.memory)
+        self.memory = np.where(sees, self.cell[:, None], unless_seen)
 
     def _believed_kitchen(self):
         """The kind of each cell as each cook remembers it, int [N, cooks, cells]."""
@@ -551,7 +565,7 @@ class Overcooked(MacroVectorEnv):
         gets_something = self._gets_food() | self._gets_plate()
         return gets_something & (cell != self._remembered_target())
 
-    # ---- small helpers: of each cook, [N, cooks], or of k cells or things in each environment, [N, k] ----------------
+    # ---- small helpers; they take and return [N, cooks], or [N, k] for any k cells or things ----------------------
     def _cook_cells(self):
         return self.cell[:, COOK:]
 
@@ -571,7 +585,7 @@ class Overcooked(MacroVectorEnv):
         return (self.cell[:, None, PLATE:BOARD] == cell[:, :, None]).any(axis=2)
 
     def _thing_in(self, cell):
-        """What is in a cell: NOTHING, a vegetable, or a plate, whose number is greater than that of what is on it."""
+        """What is in a cell: NOTHING, a vegetable, or a plate; of a plate and what is on it, the plate."""
         is_there = self.cell[:, None, :BOARD] == cell[:, :, None]  # [N, k, vegetables and plates]
         return np.where(is_there, np.arange(BOARD), NOTHING).max(axis=2)
 
@@ -639,7 +653,10 @@ def _is_plate(thing):
 
 
 def _first_moves(own, target, believed):
-    """`first_move` for M cooks at once, int [M]. own and target: cells, int [M]. believed: kinds, int [M, cells]."""
+    """`first_move` for M cooks at once, int [M]. own and target: cells, int [M]. believed: kinds, int [M, cells].
+
+    Which thing is in the way does not matter, so each becomes COUNTER. Then more searches are equal and made only once.
+    """
     is_way = (believed == FLOOR) | (believed == COOK)
     kinds = np.where(is_way, believed, COUNTER)
     searches = np.column_stack([own, target, kinds]).astype(np.uint8)
