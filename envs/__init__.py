@@ -57,6 +57,7 @@ def register(env_id, domain, defaults=None, **kwargs):
         spec_kwargs["domain"] = _path(domain)
     else:
         single = functools.partial(make_single, domain=domain)
+        single.metadata = make_single.metadata
         batch = functools.partial(make_batch, domain=domain)
     gym.register(f"{env_id}-v0", single, vector_entry_point=batch, kwargs=spec_kwargs)
     _TASKS[env_id] = domain, kwargs, defaults or {}

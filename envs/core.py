@@ -395,3 +395,6 @@ class SingleMacroEnv(gym.Env):
     def render(self):
         frames = self.vector_env.render()
         return frames[0] if frames else None
+
+    def close(self):
+        self.vector_env.close()

@@ -240,6 +240,15 @@ def test_render_modes_that_gymnasium_wraps():
     with pytest.raises(ValueError, match="render_mode must be None or one of"), pytest.warns(UserWarning):
         gym.make("bp-10-v0", render_mode="ansi")
 
+    class OfAFunction(BoxPushing):
+        pass
+
+    envs.register("of-a-function", OfAFunction, grid=6)
+    of_a_function = gym.make("of-a-function-v0", render_mode="rgb_array_list")
+    of_a_function.reset(seed=0)
+    assert len(of_a_function.render()) == 1
+    of_a_function.close()
+
 
 def test_human_rendering_shows_pictures_or_says_what_is_missing():
     try:
