@@ -19,7 +19,6 @@ import re
 import subprocess
 import sys
 import tempfile
-import threading
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,7 +35,6 @@ ORIGIN = "origin.json"
 KEY = ["algorithm", "env", "flags", "seed", "checksum"]
 VALUES = ["return", "discounted_return", "length", "success"]
 RUNS = "algorithm env variant seed flags commit checksum steps seconds processor date".split()
-ONE_AT_A_TIME = threading.Lock()  # Python 3.11 cannot make two syntax trees in two threads at once
 TABLES = {"runs.csv": RUNS, "evaluations.csv": [*KEY, "step", *VALUES]}
 
 
@@ -67,8 +65,10 @@ def flags_of(usual, arguments):
 
 def syntax(path):
     """The syntax tree of a module, so without comments, and without docstrings."""
-    with ONE_AT_A_TIME:
-        tree = ast.parse(path.read_text())
+    tree = None
+    while tree is None:
+        with contextlib.suppress(SystemError):  # Python 3.11 cannot make trees in two threads at once
+            tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(getattr(node, "body", None), list):
             texts = [part for part in node.body if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant)]

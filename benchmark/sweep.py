@@ -121,7 +121,10 @@ def run_job(job):
 def run_script(job, folder, log):
     """Runs a job's script, or goes on with a folder, until it ends or `stop` has a signal; returns its exit code."""
     new = [f"--env={job['env']}", f"--seed={job['seed']}", f"--runs-dir={job['place']}", *job["options"]]
-    command = [str(record.ROOT / f"{job['algorithm']}.py"), *([f"--resume={folder}"] if folder else new)]
+    again = [f"--resume={folder}"]
+    if ":" in job["env"]:  # a script imports no module that only its checkpoint names
+        again.append(f"--env={job['env']}")
+    command = [str(record.ROOT / f"{job['algorithm']}.py"), *(again if folder else new)]
     print(time.strftime("=== %F %T"), os.uname().nodename, shlex.join(command), file=log, flush=True)
     origin = {name: job[name] for name in ("flags", "variant", "checksum")}
     origin |= {"commit": record.commit(), "processor": record.processor()}

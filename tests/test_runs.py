@@ -712,7 +712,7 @@ def test_a_task_of_the_current_folder_that_goes_wrong_ends_the_run_in_one_line(t
     monkeypatch.chdir(tmp_path)
     module = importlib.import_module(script)
     options = {**SHORT, **(REPLAY if "buffer_size" in vars(module.Args) else {}), "eval_frequency": 12}
-    arguments = flags({**options, "env": "spoiled_task:spoiled", "eval_episodes": 1})
+    arguments = flags({**options, "env": "spoiled_task:spoiled", "eval_episodes": 1, "runs_dir": tmp_path / "runs"})
     code, said = run_as_program(monkeypatch, *arguments, script=script)
     assert (code, said) == (1, "Spoiled._advance: rewards must be finite, got nan for environment 1 at step 7")
     (folder,) = (tmp_path / "runs").iterdir()

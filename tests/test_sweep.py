@@ -640,3 +640,27 @@ def test_a_sweep_on_ray_is_stopped_and_survives_the_loss_of_a_node(place, cluste
     assert process.returncode == 0, told
     assert results(printed) == ["finished"] * 3, printed
     assert len(run_folders(place)) == 3 and logs(place).count("--resume") == 3
+
+
+@pytest.mark.parametrize(
+    ("env", "again"), [("wtd-s", ["--resume=runs/x"]), ("my:task", ["--resume=runs/x", "--env=my:task"])]
+)
+def test_a_run_of_a_task_of_ones_own_is_resumed_with_its_name(tmp_path, monkeypatch, env, again):
+    """A script imports no module that only its checkpoint names."""
+    commands = []
+
+    class Ended:
+        def __init__(self, command, **options):
+            commands.append(command)
+
+        def poll(self):
+            return 0
+
+    monkeypatch.setattr(sweep.subprocess, "Popen", Ended)
+    monkeypatch.setattr(record, "commit", lambda: "")
+    job = dict(
+        algorithm="avf_vdn", env=env, seed="1", place=str(tmp_path), options=[], flags="", variant="", checksum=""
+    )
+    with open(tmp_path / "log.txt", "w") as log:
+        assert sweep.run_script(job, "runs/x", log) == 0
+    assert commands[0][-len(again) :] == again
