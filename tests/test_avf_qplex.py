@@ -592,6 +592,7 @@ def smoke(folder, monkeypatch, script, env_id, **options):
     return losses.calls[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", envs.IDS)
 def test_smoke_run_takes_gradient_steps(tmp_path, monkeypatch, env_id):
     smoke(tmp_path, monkeypatch, avf_qplex, env_id)
@@ -771,6 +772,7 @@ def test_random_streams_share_no_numbers(tmp_path, monkeypatch, matrix_game, scr
         assert not drawn[one] & drawn[other], (one, other)
 
 
+@pytest.mark.slow
 @every_q_learner
 def test_the_default_run_ends_without_hysteresis(tmp_path, monkeypatch, matrix_game, script):
     """By the schedule on all tasks, and by the last update of a run with lengths of a 500th of those on bp-10."""

@@ -66,6 +66,7 @@ def test_always_move_to_target_is_as_good_as_on_the_published_benchmark(
         assert abs(here.mean() - published) < 3 * math.hypot(here.std() / math.sqrt(episodes), error)
 
 
+@pytest.mark.slow
 def test_one_step_versions_of_the_macro_actions_capture_as_often_as_measured():
     """Random play captures in 0.7% of all episodes, always Move-to-T in 53%."""
     env, rng = envs.make("ct-10-onestep", num_envs=2000), np.random.default_rng(2)

@@ -159,6 +159,7 @@ def test_target_by_hand(terminated):
     assert target == ([11.9375, 5.75, 10.0, 12.0] if terminated else [11.9609375, 5.84375, 10.75, 15.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["wtd-s", "wtd-t1", "bp-10", "ct-10"])
 def test_values_at_rows_are_those_of_acting(env_id):
     """Real play: the joint history moves at every row, the final one included. Shorter episodes are padded."""

@@ -44,6 +44,7 @@ def assert_same(first, second):
         np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.slow
 @every_task
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**31), num_envs=st.integers(1, 5), stay_away=st.booleans())
@@ -83,6 +84,7 @@ def test_step_contract(env_id, seed, num_envs, stay_away):
             elapsed[over], returns[over] = 0, 0.0
 
 
+@pytest.mark.slow
 @every_task
 def test_every_macro_action_ends(env_id):
     """No macro-action outlives the episode, and names, sizes and spaces agree."""
@@ -106,6 +108,7 @@ def test_gymnasium_checker(env_id):
     assert isinstance(batch, envs.MacroVectorEnv) and batch.num_envs == 3
 
 
+@pytest.mark.slow
 @every_task
 def test_same_seed_same_trajectory(env_id):
     history = play(envs.make(env_id, 3), 120, seed=0)
@@ -131,6 +134,7 @@ def test_no_call_changes_what_another_returned(env_id):
     assert_same(list(first), kept)
 
 
+@pytest.mark.slow
 @every_task
 def test_single_view_is_the_batch_of_one(env_id):
     batch, single = envs.make(env_id, 1), gym.make(f"{env_id}-v0").unwrapped

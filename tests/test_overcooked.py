@@ -397,6 +397,7 @@ def test_a_bad_argument_is_one_line(keyword, value, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_random_play_keeps_things_apart():
     """A thing in a cook's cell is in its hand, one in a plate's cell on the plate, and no other two share a cell."""
     rng = np.random.default_rng(0)

@@ -19,6 +19,7 @@ def has_initiation_sets(env_id):
     return type(envs.make(env_id))._can_start is not envs.MacroVectorEnv._can_start
 
 
+@pytest.mark.slow
 @every_task
 def test_pettingzoo_finds_nothing_wrong(env_id, monkeypatch):
     if has_initiation_sets(env_id):
@@ -34,6 +35,7 @@ def masked(infos, rng):
     return {agent: int(rng.choice(np.flatnonzero(info["action_mask"]))) for agent, info in infos.items()}
 
 
+@pytest.mark.slow
 @every_task
 def test_it_is_the_task_of_the_scripts(env_id):
     """The same seed and the same macro-actions give the same episode, and a mask is what is available."""
@@ -75,6 +77,7 @@ def test_keywords_pictures_and_errors():
         envs.to_pettingzoo("bp")
 
 
+@pytest.mark.slow
 @every_task
 def test_torchrl_steps_the_task(env_id):
     """Random play by TorchRL, which draws what the masks allow: a busy agent's action is what it runs."""

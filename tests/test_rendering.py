@@ -111,6 +111,7 @@ def test_render_gives_a_frame_for_each_environment_and_none_without_a_render_mod
     assert blind.render() is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", sorted(DOMAINS))
 def test_drawing_changes_neither_the_environment_nor_its_random_numbers(env_id):
     drawn, plain = started(env_id), started(env_id)
@@ -272,6 +273,7 @@ def test_the_number_of_carried_tools_is_seen():
     assert (picture(env) != two).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_staged_and_carried_tools_are_drawn_in_their_colours(layout):
     env = started(f"wtd-{layout}")

@@ -622,6 +622,7 @@ def edits(saved):
     yield "half a row", saved | {"buffer": [rows[:-1] for rows in saved["buffer"]]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", ["avf_qplex", "mac_iaicc"])
 def test_an_edited_checkpoint_is_refused_in_one_line(tmp_path, monkeypatch, script):
     module = importlib.import_module(script)

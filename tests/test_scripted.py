@@ -86,6 +86,7 @@ def test_one_robot_alone_is_late():
     assert result["length"][0] == 63 and result["return"][0] == 100 + 80 + 80 - 63
 
 
+@pytest.mark.slow
 def test_always_move_to_target():
     result = play("ct-10", go_to_target, 4000, seed=1, gamma=0.98)
     assert 0.50 < result["return"].mean() < 0.55

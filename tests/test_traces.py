@@ -13,7 +13,7 @@ FOLDERS = (HERE.parents[1] / "shared" / "traces", HERE / "traces")  # all ten, a
 
 BOX_PUSHING = ["bp-10", "bp-20", "bp-30"]
 WAREHOUSE = ["wtd-s", "wtd-d", "wtd-t", "wtd-t1"]
-OVERCOOKED = ["overcooked-a", "overcooked-b", "overcooked-c"]
+OVERCOOKED = [pytest.param(f"overcooked-{layout}", marks=pytest.mark.slow) for layout in "abc"]
 
 
 @pytest.mark.parametrize("env_id", BOX_PUSHING + WAREHOUSE + OVERCOOKED)

@@ -81,6 +81,7 @@ def test_what_an_agent_cannot_start_replaces_nothing(monkeypatch):
     assert found[0].tolist() == found[1].tolist()
 
 
+@pytest.mark.slow
 def test_all_replacements_are_listed(run):
     script, args, learner, _ = play.load_run(run, "last")
     _, recorder = play.watch(script, args, learner, 1, args.seed)

@@ -140,6 +140,7 @@ def test_situations_are_those_of_the_paper_and_are_among_the_initiation_sets(siz
     assert len(set(every)) == len(every) == np.prod([2**size - 1 for size in sizes])
 
 
+@pytest.mark.slow
 @MANY
 @given(tables(), st.data())
 def test_with_what_is_available_eq_7_is_the_papers_for_free_and_busy_agents(table, data):
@@ -346,6 +347,7 @@ def test_all_terminated_mac_igm_is_igm(ties, table, data):
     assert macadv_igm(q, utilities, available, value, values, ties) == adv_igm(q, utilities, ties)
 
 
+@pytest.mark.slow
 @ties_of_every_kind
 @MANY
 @given(table=tables(), data=st.data())
@@ -505,6 +507,7 @@ def busy_agents_run_durative_ones(available, sizes):
     return True
 
 
+@pytest.mark.slow
 @ties_of_every_kind
 @MANY
 @given(table=tables(max_agents=3, max_actions=3), data=st.data())
@@ -710,6 +713,7 @@ def test_batch_takes_one_situation_for_all_and_refuses_wrong_shapes():
             mac_igm_batch(q, utilities, available)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failing", range(4))
 def test_the_strategy_reaches_both_verdicts_in_every_reading(failing):
     """Else equal verdicts would say little. failing: in how many of the readings, the strictest first."""

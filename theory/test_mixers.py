@@ -590,6 +590,7 @@ def test_the_revisions_lambda_loses_a_part_where_not_all_agents_deviate():
         assert close(made[0], *expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CLASSES)
 def test_networks_lie_in_the_class_stated_for_them(name):
     """The cones that `residuals` measures against contain what the mixers compute, in all situations together."""

@@ -19,6 +19,7 @@ TOLD = {  # p and the bound
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", TOLD)
 def test_the_page_tells_what_is_counted(env_id):
     p, bound = TOLD[env_id]
