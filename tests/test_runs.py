@@ -649,6 +649,15 @@ def test_a_task_that_changed_is_not_resumed(tmp_path, monkeypatch):
         assert one_line(str(stopped.value))
 
 
+def test_an_empty_folder_name_is_the_current_folder(tmp_path, monkeypatch):
+    """An empty --resume begins no new run."""
+    cut_episodes(monkeypatch, 25)
+    folder = interrupted(monkeypatch, avf_qplex, short(avf_qplex, "bp-10", tmp_path, total_timesteps=80), steps=2)
+    monkeypatch.chdir(folder)
+    train(parse_args(["--resume="]))
+    assert not (folder / "checkpoint.pt").exists() and load(folder / "last.pt")["step"] == 80
+
+
 def test_no_file_decides_which_module_is_imported(tmp_path, monkeypatch):
     """A task of one's own has to be named again to resume its run."""
     (tmp_path / "my_task.py").write_text("raise SystemExit('it was imported')\n")
