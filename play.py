@@ -3,9 +3,10 @@
     python play.py runs/<folder> --gif team.gif --timeline team.png
     python play.py runs/<folder> --rows 0-8
 
-The model plays --episodes greedy episodes side by side, of which means and standard errors are printed. Animation,
-timeline and rows are those of the first of them, that of environment 0 (so, where a task has chance, of another one for
-another --episodes). No code of a run folder runs, and a module that it names is imported only if --env names it, too.
+The model plays --episodes greedy episodes side by side, one in each environment, and the program prints means and
+standard errors over them. Animation, timeline and rows show the first episode, the one in environment 0. Where a task
+has chance, that episode changes with --episodes. No code of a run folder runs, and a module that it names is imported
+only if --env names it, too.
 """
 
 import argparse
@@ -83,8 +84,8 @@ class Episode(NamedTuple):
 class Recorder:
     """Behaves as the batch of environments it is given and records the first episode of environment 0.
 
-    frames: a list that receives its pictures, MOST_FRAMES at most, or None. probabilities: what the networks say are
-    logits.
+    frames: a list that receives its pictures, MOST_FRAMES at most, or None. probabilities: whether the networks say
+    logits, which the Episode then holds as probabilities. Any other attribute is that of the batch.
     """
 
     def __init__(self, env, frames=None, probabilities=False):
@@ -100,7 +101,7 @@ class Recorder:
 
     def listen(self, module, inputs, output):
         """A forward hook for the agents' networks, which run before each step."""
-        values = output[0]  # [n, N, 1, A], or [N, 1, J] of one network for the whole team
+        values = output[0]  # [n, N, 1, A] of N environments, or [N, 1, J] of one network over J joint macro-actions
         self.said = values[:, 0, 0].detach() if values.dim() == 4 else None
 
     def reset(self, **options):
@@ -126,12 +127,13 @@ class Recorder:
 
     def episode(self):
         """The Episode up to now."""
-        labels = list(range(self.n_agents))
+        labels = list(range(self.env.n_agents))
         if isinstance(self.env, Warehouse):
             labels[-1] = ARM
         return Episode(
             labels=labels,
-            names=self.macro_action_names,
+            names=self.env.macro_action_names,
+            # An agent that is free before a step chooses. What it then runs is known after the step.
             chosen=np.concatenate([step.infos["macro_done"] for step in self.steps]),
             running=np.concatenate([step.next_infos["macro_action"] for step in self.steps]),
             rewards=np.concatenate([step.rewards for step in self.steps]),
@@ -140,7 +142,7 @@ class Recorder:
         )
 
     def _utilities(self):
-        """Those of an Episode. They are None if one network speaks for the whole team."""
+        """The utilities of the Episode, or None if one network speaks for the whole team."""
         if self.steps[0].said is None:
             return None
         said = torch.stack([step.said for step in self.steps])  # [T, n, A]
@@ -167,20 +169,21 @@ def draw(env, earlier):
 
 
 def watch(script, args, learner, episodes, seed, frames=None):
-    """Plays greedily: the script's results, a dict of float64 [episodes], and the Recorder of the first.
+    """Plays greedily: the script's results, a dict of float64 [episodes], and the Recorder of the first episode.
 
-    frames: a list that receives its pictures, or None.
+    frames: a list that receives the pictures of the first episode, or None.
     """
-    recorder = Recorder(envs.make(args.env, episodes), frames, probabilities="critics" in learner)
+    has_actors = "critics" in learner  # then the agents' networks are actors, which say logits
+    recorder = Recorder(envs.make(args.env, episodes), frames, probabilities=has_actors)
     hook = learner["agents"].register_forward_hook(recorder.listen)
     result = script.evaluate(learner["agents"], recorder, args.gamma, seed)
     hook.remove()
     return result, recorder
 
 
-# ---- its rows -------------------------------------------------------------------------------------------------------
+# ---- rows of the episode --------------------------------------------------------------------------------------------
 def remember(script, args, steps):
-    """The rows of an ended episode of Steps as the script's training loop and replay buffer make them, an array [T]."""
+    """The rows of an ended episode of Steps as the script's training loop and buffer make them, a structured array."""
     env = envs.make(args.env)
     buffer = script.ReplayBuffer(env, 1) if hasattr(script, "ReplayBuffer") else script.EpisodeBuffer(env)
     for step in steps:
@@ -189,12 +192,12 @@ def remember(script, args, steps):
         discount = np.where(step.terminated, 0.0, args.gamma)
         buffer.add_step(*state, args.reward_scale * step.rewards, discount)
     buffer.end_episodes(steps[-1].over, steps[-1].next_obs, steps[-1].next_infos)
-    return buffer.ended[0]
+    return buffer.ended[0]  # the only episode in it
 
 
 def describe_rows(script, args, recorder, first, last):
     """Lines of at most COLUMNS characters: the rows from one number to another as the script's replay buffer holds
-    them (Fig. 2 of the paper), each with a line for every agent. The row after the last choice is the final one.
+    them (Fig. 2 of the paper), each with a line for every agent. The final row is the end of the episode.
 
     Raises:
         ValueError: the episode has no such rows.
@@ -227,7 +230,7 @@ def describe_rows(script, args, recorder, first, last):
             if row == final:
                 name = "-"
                 here = "free"
-            obs = rows["obs"][row, agent, : recorder.obs_sizes[agent]]
+            obs = rows["obs"][row, agent, : recorder.env.obs_sizes[agent]]
             saw = " ".join(f"{round(number, 2) + 0.0:g}" for number in obs.tolist())  # + 0.0: not -0
             lines.append(f"{left:34} | {label:<6}{name:{wide}}{since:5}  {here:9}{saw}")
             left = ""
@@ -247,7 +250,7 @@ def reason(error):
 
 
 def read_model(path):
-    """Algorithm, settings, networks and step of a model that a script saved. No code of the file runs."""
+    """Algorithm, settings, networks and training step of a model that a script saved. No code of the file runs."""
     if not path.is_file():  # to read from a pipe could take for ever
         fail(f"there is no model {path}")
     try:
@@ -258,12 +261,12 @@ def read_model(path):
         return saved["algorithm"], dict(saved["args"]), saved["networks"], int(saved["step"])
     except OSError as error:
         fail(error)
-    except Exception:  # of many classes; torch's words for some advise to load the file unsafely
+    except Exception:  # of many classes; some messages of torch advise to load the file unsafely
         fail(f"{path} is damaged, or not the model of a script")
 
 
 def load_run(folder, name, env=None):
-    """A run folder's script and Args (on the CPU), the learner with its "best" or "last" model, and that one's step.
+    """A run folder's script and Args (on the CPU), the learner with its "best" or "last" model, and its training step.
 
     env: the run's task. It has to be given if it is a "module:id".
     """
@@ -291,7 +294,8 @@ def load_run(folder, name, env=None):
 
 # ---- the command line -----------------------------------------------------------------------------------------------
 def write(path, save):
-    """Writes beside the path what `save` writes into a stream, and swaps, so that a failure leaves what was there."""
+    """Writes to the path what `save` writes into a stream. A failure leaves what was there."""
+    # A new file beside it takes its place when it is complete.
     new = Path(f"{path}.new")
     content = io.BytesIO()
     try:
@@ -319,10 +323,10 @@ def parse_args(argv=None):
     parser.add_argument("run", help="folder of a run of any script")
     parser.add_argument("--env", help="the run's task; needed if it is a module:id, which is then imported")
     parser.add_argument("--episodes", type=int, default=100, help="how many to play (default: 100)")
-    parser.add_argument("--model", choices=("best", "last"), default="best", help="of which evaluation (default: best)")
+    parser.add_argument("--model", choices=("best", "last"), default="best", help="which saved model (default: best)")
     parser.add_argument("--seed", type=int, help="of the episodes, from 0 on (default: that of the run)")
-    parser.add_argument("--gif", metavar="FILE", help=f"write an animation of its first {MOST_FRAMES - 1} steps")
-    parser.add_argument("--timeline", metavar="FILE", help="draw its macro-actions and rows, as .png, .svg or .pdf")
+    parser.add_argument("--gif", metavar="FILE", help=f"animate the first episode, up to {MOST_FRAMES - 1} steps")
+    parser.add_argument("--timeline", metavar="FILE", help="draw its macro-actions and rows (.png, .svg or .pdf)")
     parser.add_argument("--rows", metavar="A-B", help="print its rows A to B as the replay buffer holds them")
     parser.add_argument("--steps", metavar="A-B", help="with --timeline: only time A to B, enlarged, with utilities")
     options = parser.parse_args(argv)

@@ -25,17 +25,17 @@ MARGIN = 17  # from its left edge to the text above and below the strips
 FOOT = 18  # from the last strip to its lower edge
 ROWS = 10  # from the top of a strip to the numbers of its rows
 LANES = 30  # from the top of a strip to the bars of the first agent
-TIME = 88  # from the top of a strip to its axis of time, without the lanes
-STRIP = 122  # height of a strip without its lanes
+TIME = 88  # from the top of a strip to its axis of time, less the height of the lanes between them
+STRIP = 122  # height of a strip, less that of its lanes
 LANE = 30  # height of an agent's lane: a bar and the names below it
 LANE_WITH_UTILITIES = 57  # height of a lane with room for three utilities, too
 SMALL = 7  # sizes of text
 LARGE = 8.5
 
-# Matplotlib's options for text whose letters are equally wide, for the box around a tag, and for the dot where an agent
-# chooses. LETTER is the width of a small letter of that text.
+# Matplotlib's options. MONO is for text whose letters are equally wide, on white. TAG is for the box around ONGOING.
+# DOT is for the dot where an agent chooses.
 MONO = {"family": "monospace", "bbox": {"facecolor": WHITE, "edgecolor": "none", "pad": 1}}
-LETTER = 0.63 * SMALL
+LETTER = 0.63 * SMALL  # width of a letter of MONO at size SMALL
 TAG = {"boxstyle": "round,pad=0.15,rounding_size=0.5", "facecolor": WHITE}
 DOT = {"marker": "o", "markersize": 7, "color": INK, "markeredgecolor": WHITE, "clip_on": False, "zorder": 3}
 RULE = "#aab5bf"  # colour of the lines at rows
@@ -43,7 +43,7 @@ RULE = "#aab5bf"  # colour of the lines at rows
 ONGOING = "m⁻"  # the paper's sign for a macro-action that goes on while others are chosen
 WORDS = "Asynchronous: macro-actions end at different times, so at a row some agents choose and the others go on."
 LEGEND = [
-    "▬ macro-action · its steps (6, 1: twice in a row)",
+    "▬ macro-action · its steps (6, 1: twice in a row)",  # of 6 steps, then the same one again, of 1 step
     "● an agent chooses",
     "│ row: a time at which at least one agent chooses",
 ]
@@ -59,13 +59,14 @@ def draw(episode, title, facts, steps=None):
     most_steps = 12 if steps else 45  # in a strip
     count = ceil((last - first) / most_steps)  # of strips
     length = ceil((last - first) / count)  # of a strip in steps
-    first_end = min(first + length, last)  # of the first strip, which contains the example row
+    first_end = min(first + length, last)  # of the first strip
+    # The lines above the strips explain one row, the example row. It is in the first strip.
     example = example_row(episode, first, first_end)
     utilities = episode.utilities if steps else None
     lane = LANE if utilities is None else LANE_WITH_UTILITIES
     lines = [facts, WORDS, *LEGEND]
     if utilities is not None:
-        lines.append(f"0.50 {episode.meaning}, highest first, 3 at most")
+        lines.append(f"0.50 {episode.meaning}, highest first, 3 at most")  # 0.50 is a sample
     lines += ["", *describe(episode, example, first_end)]
     head = 40 + 14 * len(lines)  # from the upper edge of the figure to the strips
     strip_height = STRIP + lane * len(episode.labels)
@@ -188,7 +189,7 @@ class Strip:
     episode: object  # a play.Episode
     first: int
     last: int
-    pitch: float  # width of a step
+    pitch: float  # width of a step; points divided by it are steps, the unit of x
     lane: int  # height of an agent's lane
     utilities: np.ndarray | None  # those of the episode, or None if they are not shown
     shortened: set  # receives the names that are abbreviated
@@ -290,7 +291,7 @@ class Strip:
 
         If it abbreviates the name, the name is added to `shortened`.
         """
-        words = next((words for words in candidates if wide(words) <= self.letters(steps)), "")
+        words = next((candidate for candidate in candidates if wide(candidate) <= self.letters(steps)), "")
         if shorten(name) in words and name not in words:
             self.shortened.add(name)
         return words
