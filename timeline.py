@@ -67,7 +67,7 @@ def draw(episode, title, facts, steps=None):
     lines = [facts, WORDS, *LEGEND]
     if utilities is not None:
         lines.append(f"0.50 {episode.meaning}, highest first, 3 at most")  # 0.50 is a sample
-    lines += ["", *describe(episode, example, first_end)]
+    lines += ["", *describe(episode, example, first, first_end)]
     head = 40 + 14 * len(lines)  # from the upper edge of the figure to the strips
     strip_height = STRIP + lane * len(episode.labels)
     height = head + strip_height * count + FOOT
@@ -127,10 +127,10 @@ def example_row(episode, first, last):
     return max(candidates, key=score, default=None)
 
 
-def describe(episode, row, last):
-    """Lines about the example row. If there is none, they say that all agents choose at every row until `last`."""
+def describe(episode, row, first, last):
+    """Lines about the example row. If there is none, one that says that nobody is ongoing at any row between."""
     if row is None:
-        return [f"Up to t = {last} all agents choose at every row: nobody is ongoing."]
+        return [f"At no row between t = {first} and t = {last} an agent is ongoing."]
     chosen = []
     ongoing = []
     for agent, label in enumerate(episode.labels):

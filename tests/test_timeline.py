@@ -124,8 +124,10 @@ def test_the_marked_row_says_who_chooses_and_who_is_ongoing(episode):
     assert [(time, top) for time, top, _ in lines(strip, INK)] == [(1, 0)]
     together = episode._replace(chosen=np.ones_like(episode.chosen))
     page, strip = timeline.draw(together, "title", "facts").axes
-    assert "Up to t = 8 all agents choose at every row: nobody is ongoing." in said(page)
+    assert "At no row between t = 0 and t = 8 an agent is ongoing." in said(page)
     assert not places(strip, "m⁻") and not lines(strip, INK)
+    page, _ = timeline.draw(episode, "title", "facts", (1, 2)).axes
+    assert "At no row between t = 1 and t = 2 an agent is ongoing." in said(page), "at row 1 itself one is"
 
 
 def test_title_facts_and_legend(episode):
