@@ -199,7 +199,8 @@ class Overcooked(MacroVectorEnv):
           an unchopped vegetable; Go-to-Board and it holds nothing; Get-(a vegetable) and an unchopped vegetable is on
           the board that is its target; Get-... and the thing is not where the cook remembers it.
         - If the cook holds a chopped vegetable, Get-Plate does not end with this move, which puts the vegetable on the
-          plate. The next one takes the plate.
+          plate. The next one takes the plate. Nor does it end here if there is no such move because the plate is not
+          where the cook remembers it.
         - It ends without a move if there is no way. If the cook has the target in view, it also ends without a move in
           two cases: the cook believes that a cook, possibly itself, is in the target's cell; a plate is in the target's
           cell and the macro-action is Get-(a vegetable).
