@@ -51,6 +51,7 @@ class Simulator:
     def __init__(self, env):
         """Raises ValueError if env is of another kind."""
         self.env = env
+        # PettingZoo's other kind of environment, an `AECEnv`, has `possible_agents` and `agent_iter`.
         self.is_parallel = hasattr(env, "possible_agents") and not hasattr(env, "agent_iter")
         spaces = [getattr(env, name, None) for name in ("observation_space", "action_space")]
         if self.is_parallel:
@@ -77,7 +78,8 @@ class Simulator:
 
         Returns what `reset` returns, the sum of the agents' rewards, whether the episode terminated, and whether it was
         truncated. In PettingZoo an episode is over when no agent is left. It terminated if all agents that were there
-        in its last step terminated.
+        in its last step terminated. Otherwise it was truncated. A Gymnasium environment says both
+        itself. Where it says so for each agent, it must be true for all agents.
         """
         if not self.is_parallel:
             obs, rewards, terminated, truncated, _ = self.env.step(tuple(actions))
@@ -104,11 +106,12 @@ class OptionsEnv(MacroVectorEnv):
 
     Macro-observations: what the simulator lets the agent observe, flattened, and what `observe` adds. An agent that has
         left the episode observes zeros.
-    State: what `state` gives, or the observations of all agents. Then, for each agent, which option it is running
-        (one-hot, zeros for a free agent) and for how long, in tens of steps.
+    State: it begins with what `state` gives, or with the observations of all agents. For each agent it then has which
+        option it is running (one-hot) and for how long (in tens of steps). Both are zeros for a free agent.
     Rewards: the sum of the agents' rewards.
     Episode end: when the simulator terminates or truncates the episode, or at the horizon. An agent that leaves early
-        ends no macro-action and chooses nothing more: until the episode ends it counts as busy.
+        ends no macro-action and chooses nothing more. It counts as busy until the episode ends or it comes back. If it
+        comes back, it is free.
 
     Checkpoints hold arrays alone: the seed of each running episode and the macro-actions that were chosen in it. When a
     saved state is loaded, these episodes are played again. Some simulators do not repeat themselves for a seed. Where
@@ -116,6 +119,7 @@ class OptionsEnv(MacroVectorEnv):
     next step, so that a new one begins.
     """
 
+    # A checkpoint holds these arrays.
     sim_arrays = ("seeds", "choices", "age", "views", "sim_state")
 
     def __init__(
@@ -138,11 +142,13 @@ class OptionsEnv(MacroVectorEnv):
             make: `make()` returns a simulator.
             options: a list of Options for all agents, or a list of such lists, one for each agent.
             horizon: steps after which an episode is truncated, at least 1.
-            observe: `observe(sim, agent)` returns numbers that the agent observes besides, always equally many.
-            state: `state(sim)` returns the simulator's true state, numbers, always equally many.
+            observe: `observe(sim, agent)` returns numbers that are appended to what the simulator lets the agent
+                observe. For one agent they are always equally many.
+            state: `state(sim)` returns numbers, the simulator's true state. They are always equally many.
             success: `success(sim)` says at the end of an episode whether the task's goal is reached. Without it,
                 success is never reported.
-            scale: factor on macro-observations and on what `state` gives. They should be of the order of 1.
+            scale: factor on macro-observations and on the simulator's part of the state. The products should be of the
+                order of 1.
             render_mode: None or "rgb_array". Pictures are those of the simulator's own `render()`.
 
         Raises:
@@ -157,24 +163,25 @@ class OptionsEnv(MacroVectorEnv):
         self.sims = [first, *(Simulator(make()) for _ in range(num_envs - 1))]
         self.options = options_of_agents(options, len(first.names))
 
-        seen = first.reset(seed=0)
+        seen = first.reset(seed=0)  # only to learn how long observations and state are
         sizes = []
         for agent, space in enumerate(first.observation_spaces):
             sizes.append(flatdim(space) + len(self._more(first, agent)))
         bound = np.full((len(sizes), max(sizes)), np.inf)
         names = [[option.name for option in own] for own in self.options]
         sim_state = self._simulator_state(first, seen)
-        state_size = len(sim_state) + len(names) * (max(map(len, names)) + 1)
+        most_options = max(map(len, names))
+        state_size = len(sim_state) + len(names) * (most_options + 1)  # one-hot and time
         super().__init__(num_envs, names, -bound, bound, sizes, state_size, horizon, render_mode)
 
         self.seeds = np.zeros(num_envs, np.int64)
-        self.choices = np.zeros((num_envs, self.horizon, self.n_agents), np.int32)  # macro_action of each step
-        self.age = np.zeros((num_envs, self.n_agents), np.int64)  # steps of the option that runs or ran last
-        self.views = np.zeros((num_envs, *bound.shape), np.float32)  # what each agent would observe now
-        self.sim_state = np.zeros((num_envs, len(sim_state)), np.float32)
-        self.running = [[None] * self.n_agents for _ in self.sims]  # generators, None where an agent runs nothing
+        self.choices = np.zeros((num_envs, self.horizon, self.n_agents), np.int32)  # who ran which option in each step
+        self.age = np.zeros((num_envs, self.n_agents), np.int64)  # steps taken of the option that runs or ran last
+        self.views = np.zeros((num_envs, *bound.shape), np.float32)  # what each agent would observe if it were free
+        self.sim_state = np.zeros((num_envs, len(sim_state)), np.float32)  # the simulator's part of the state
+        self.running = [[None] * self.n_agents for _ in self.sims]  # generators, None where an agent has started none
         self.actions = [[None] * self.n_agents for _ in self.sims]  # the primitive actions of the next step
-        self.lost = np.zeros(num_envs, bool)  # the simulator is not in the state that was loaded
+        self.lost = np.zeros(num_envs, bool)  # whether a loaded episode did not come out as it was
 
     # ---- what there is to see -----------------------------------------------------------------------------------
     def _more(self, sim, agent):
@@ -182,7 +189,10 @@ class OptionsEnv(MacroVectorEnv):
         return [] if self.observe is None else self.observe(sim.env.unwrapped, agent)
 
     def _simulator_state(self, sim, seen):
-        """What the state begins with. seen: what each agent observes, n flat arrays or None for those who are gone."""
+        """The simulator's part of the state.
+
+        seen: what each agent observes, a list of n flat arrays, None for an absent agent.
+        """
         if self.state is not None:
             return self.scale * np.asarray(self.state(sim.env.unwrapped), np.float32)
         parts = []
@@ -205,9 +215,9 @@ class OptionsEnv(MacroVectorEnv):
 
     def _state(self):
         runs = self.macro_action[:, :, None] == np.arange(self.own_actions.shape[1])  # [N, n, A]
-        timers = np.concatenate([runs, self.age[:, :, None] / 10], axis=2)
-        timers[self.macro_done] = 0
-        flat = timers.reshape(self.num_envs, -1)
+        progress = np.concatenate([runs, self.age[:, :, None] / 10], axis=2)  # [N, n, A + 1]
+        progress[self.macro_done] = 0
+        flat = progress.reshape(self.num_envs, -1)
         return np.concatenate([self.sim_state, flat], axis=1, dtype=np.float32)
 
     def _draw(self, index):
@@ -246,13 +256,13 @@ class OptionsEnv(MacroVectorEnv):
     def _initiation_set(self, e, agent):
         """Which of its options the agent can start, a list of bools."""
         step = self.elapsed[e]
-        sim = self.sims[e].env.unwrapped
+        unwrapped = self.sims[e].env.unwrapped
         can_start = []
         for option in self.options[agent]:
             try:
-                can_start.append(bool(option.available(sim, agent)))
+                can_start.append(bool(option.available(unwrapped, agent)))
             except Exception as error:
-                raise OptionError(describe(option, agent, step, f"available: {place(error)}")) from error
+                raise OptionError(describe(option, agent, step, f"available: {error_and_line(error)}")) from error
         if not any(can_start):
             names = ", ".join(option.name for option in self.options[agent])
             raise OptionError(f"agent {agent} at step {step} can start none of its options: {names}")
@@ -264,14 +274,13 @@ class OptionsEnv(MacroVectorEnv):
         ended = np.zeros(self.macro_done.shape, bool)
         success = np.zeros(self.num_envs, bool)
         for e, sim in enumerate(self.sims):
-            step = self.elapsed[e] - 1
+            step = self.elapsed[e] - 1  # elapsed counts this step already
             self.choices[e, step] = self.macro_action[e]
             if self.lost[e]:
                 self.cut[e] = True
                 continue
-            rewards[e], terminations[e], self.cut[e], ended[e] = self._play(
-                e, step, self.macro_action[e], self.macro_done[e]
-            )
+            starts = self.macro_done[e]  # who was free before this step starts its option in it
+            rewards[e], terminations[e], self.cut[e], ended[e] = self._play(e, step, self.macro_action[e], starts)
             is_over = terminations[e] or self.cut[e] or step + 1 == self.horizon
             if is_over and self.succeeded is not None:
                 success[e] = self.succeeded(sim.env.unwrapped)
@@ -280,7 +289,8 @@ class OptionsEnv(MacroVectorEnv):
     def _play(self, e, step, choices, starts):
         """Takes one step of environment e.
 
-        choices: int [n], the option that each agent runs. starts: bool [n], who starts it in this step.
+        step: how many steps the episode had before. choices: int [n], the option that each agent runs. starts: bool
+        [n], which agents start it in this step.
 
         Returns the reward, whether the episode terminated, whether it was truncated, and whose options ended, bool [n].
         """
@@ -298,28 +308,32 @@ class OptionsEnv(MacroVectorEnv):
         if terminated or truncated:
             return reward, terminated, truncated, ended
 
+        # Generators go on at once to the action of the next step. One that returns instead ends its option.
         for agent, generator in enumerate(running):
             if not sim.here[agent]:
-                running[agent] = None  # an agent that comes back chooses anew
+                running[agent] = None
                 continue
-            actions[agent] = None if generator is None else next(generator, None)
+            if generator is None:  # the agent has just come
+                ended[agent] = True
+                continue
+            actions[agent] = next(generator, None)
             ended[agent] = actions[agent] is None
         return reward, terminated, truncated, ended
 
     # ---- checkpoints --------------------------------------------------------------------------------------------
     def _restore(self):
         """Plays the episodes again that were running when the state was saved."""
-        running = np.flatnonzero(~self.over)
-        for e in running:
+        unfinished = np.flatnonzero(~self.over)
+        for e in unfinished:
             self.lost[e] = not self._replay(e)
-        count = np.count_nonzero(self.lost[running])
+        count = np.count_nonzero(self.lost[unfinished])
         if count:
             words = "episodes did not repeat themselves from their seeds: they are cut, and new ones begin"
-            print(f"{count} of {len(running)} {words}", file=sys.stderr)
+            print(f"{count} of {len(unfinished)} {words}", file=sys.stderr)
 
     def _replay(self, e):
         """Plays the episode of environment e again. Returns whether it came out as it was saved."""
-        views = self.views[e].copy()
+        views = self.views[e].copy()  # as they were saved; playing changes these arrays
         sim_state = self.sim_state[e].copy()
         age = self.age[e].copy()
         earned = 0.0
@@ -338,6 +352,7 @@ class OptionsEnv(MacroVectorEnv):
         is_same = not is_over and np.array_equal(free, self.macro_done[e]) and np.array_equal(age, self.age[e])
         is_same = is_same and np.allclose([earned], self.episode_return[e])
         is_same = is_same and np.allclose(views, self.views[e]) and np.allclose(sim_state, self.sim_state[e])
+        # The agents last saw what was saved, also where the episode is lost.
         self.views[e] = views
         self.sim_state[e] = sim_state
         self.age[e] = age
@@ -363,15 +378,15 @@ def options_of_agents(options, n_agents):
 
 
 def primitive_actions(option, sim, agent, step):
-    """Yields what an option's generator yields.
+    """Yields what an option's generator yields, checked.
 
-    step: the time at which the option starts.
+    sim: a `Simulator`. step: how many steps the episode had when the option starts.
 
     Raises:
         OptionError: the generator yields nothing or an action outside of the agent's space, or raises an error.
     """
     space = sim.action_spaces[agent]
-    problem = "its generator yields nothing"
+    problem = "its generator yields nothing"  # until it yields something
     cause = None
     try:
         for action in option.run(sim.env.unwrapped, agent):
@@ -384,7 +399,7 @@ def primitive_actions(option, sim, agent, step):
             yield action
             step += 1
     except Exception as error:
-        problem = place(error)
+        problem = error_and_line(error)
         cause = error
     if problem:
         raise OptionError(describe(option, agent, step, problem)) from cause
@@ -395,7 +410,7 @@ def describe(option, agent, step, problem):
     return f"option {option.name} of agent {agent} at step {step}: {problem}"
 
 
-def place(error):
+def error_and_line(error):
     """An exception and where it was raised, on one line."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     message = " ".join(str(error).split())
