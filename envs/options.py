@@ -78,8 +78,8 @@ class Simulator:
 
         Returns what `reset` returns, the sum of the agents' rewards, whether the episode terminated, and whether it was
         truncated. In PettingZoo an episode is over when no agent is left. It terminated if all agents that were there
-        in its last step terminated. Otherwise it was truncated. A Gymnasium environment says both
-        itself. Where it says so for each agent, it must be true for all agents.
+        in its last step terminated. Otherwise it was truncated. A Gymnasium environment says both itself. Where it says
+        so for each agent, it must be true for all agents.
         """
         if not self.is_parallel:
             obs, rewards, terminated, truncated, _ = self.env.step(tuple(actions))
