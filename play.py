@@ -31,7 +31,7 @@ from envs.warehouse import Warehouse
 
 SCRIPTS = ("avf_vdn", "avf_qmix", "avf_qplex", "dec_maddrqn", "cen_maddrqn", "mac_iaicc")
 COLUMNS = 120  # of the terminal in which rows are printed
-MOST_FRAMES = 301  # of an animation, which takes 1 MB each in memory; the tasks of envs/ need at most 151
+MOST_FRAMES = 301  # of an animation, which takes 1 MB each in memory; overcooked needs 201
 MOST_STEPS = 1_000  # of a timeline, which takes half a minute then
 MOST_EPISODES = 100_000  # that are played side by side
 
@@ -287,7 +287,7 @@ def load_run(folder, name, env=None):
         args = script.Args(**{**settings, "device": "cpu"})
         learner = script.make_learner(args, envs.make(args.env))
         learner.load_state_dict(networks)
-    except (Exception, SystemExit) as error:  # a setting out of range, or whatever a task of one's own raises
+    except (Exception, SystemExit) as error:  # a setting out of range, or what a task of one's own raises
         fail(f"{path} does not fit its settings: {reason(error)}")
     return script, args, learner, step
 
@@ -303,7 +303,7 @@ def write(path, save):
         new.unlink(missing_ok=True)  # it could be a pipe
         new.write_bytes(content.getvalue())
         new.replace(path)
-    except Exception as error:  # the disk is full, a timeline too high for a PNG, a picture too wide for a GIF
+    except Exception as error:  # such as a full disk, or a timeline that is too high for a PNG
         fail(f"cannot write {path}: {error}")
     finally:
         with suppress(OSError):
@@ -318,24 +318,28 @@ def span(words):
 
 def parse_args(argv=None):
     """The command line; its errors are one line."""
-    parser = argparse.ArgumentParser(prog="play.py", description=__doc__.partition("\n")[0], allow_abbrev=False)
+    summary = __doc__.partition("\n")[0]
+    parser = argparse.ArgumentParser(prog="play.py", description=summary, allow_abbrev=False)
     parser.error = fail
-    parser.add_argument("run", help="folder of a run of any script")
-    parser.add_argument("--env", help="the run's task; needed if it is a module:id, which is then imported")
-    parser.add_argument("--episodes", type=int, default=100, help="how many to play (default: 100)")
-    parser.add_argument("--model", choices=("best", "last"), default="best", help="which saved model (default: best)")
-    parser.add_argument("--seed", type=int, help="of the episodes, from 0 on (default: that of the run)")
-    parser.add_argument("--gif", metavar="FILE", help=f"animate the first episode, up to {MOST_FRAMES - 1} steps")
-    parser.add_argument("--timeline", metavar="FILE", help="draw its macro-actions and rows (.png, .svg or .pdf)")
-    parser.add_argument("--rows", metavar="A-B", help="print its rows A to B as the replay buffer holds them")
-    parser.add_argument("--steps", metavar="A-B", help="with --timeline: only time A to B, enlarged, with utilities")
+    add = parser.add_argument
+    add("run", help="folder of a run of any script")
+    add("--env", help="the run's task; needed if it is a module:id, which is then imported")
+    add("--episodes", type=int, default=100, help="how many to play (default: 100)")
+    add("--model", choices=("best", "last"), default="best", help="which saved model (default: best)")
+    add("--seed", type=int, help="of the episodes, from 0 on (default: that of the run)")
+    add("--gif", metavar="FILE", help=f"animate the first episode, up to {MOST_FRAMES - 1} steps")
+    add("--timeline", metavar="FILE", help="draw its macro-actions and rows (.png, .svg or .pdf)")
+    add("--rows", metavar="A-B", help="print its rows A to B as the replay buffer holds them")
+    add("--steps", metavar="A-B", help="with --timeline: only time A to B, enlarged, with utilities")
     options = parser.parse_args(argv)
     if not 1 <= options.episodes <= MOST_EPISODES:
         fail(f"--episodes must be from 1 to {MOST_EPISODES}, got {options.episodes}")
     if options.seed is not None and options.seed < 0:
         fail(f"--seed must not be negative, got {options.seed}")
     for path, kinds in ((options.gif, [".gif"]), (options.timeline, [".png", ".svg", ".pdf"])):
-        if path is not None and (Path(path).suffix.lower() not in kinds or not Path(path).parent.is_dir()):
+        if path is None:
+            continue
+        if Path(path).suffix.lower() not in kinds or not Path(path).parent.is_dir():
             fail(f"cannot write {path}: it has to be a {' or '.join(kinds)} file in a folder that exists")
     if options.steps is not None:
         if not options.timeline:

@@ -93,7 +93,8 @@ def checksum(algorithm, env):
     domain, keywords = envs._find(env)[:2]
     code.append(re.sub(r" at 0x\w+", "", repr((domain, keywords))))  # without the addresses of functions
     names = {domain.__module__, env.rpartition(":")[0] or domain.__module__}
-    modules, todo = {}, [Path(sys.modules[name].__file__) for name in names]
+    modules = {}
+    todo = [Path(sys.modules[name].__file__) for name in names]
     while todo:
         path = todo.pop()
         if path not in modules and path.name != "rendering.py":

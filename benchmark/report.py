@@ -32,7 +32,8 @@ PAPER = json.loads((HERE / "paper.json").read_text())  # what it compares, its n
 REFERENCES = json.loads((HERE / "references.json").read_text())  # made by scripted.py
 RESAMPLES = 5_000
 LAST = 5  # evaluations at the end of a run whose mean is its final performance, so that no lucky point decides
-KEPT, NEAR = 3, 0.95  # a run solves a task when so many evaluations in a row have this share of the optimum
+KEPT = 3  # a run solves a task when so many evaluations in a row have at least the share NEAR of the optimum
+NEAR = 0.95
 EQUAL = 0.02  # of the range from random to optimum: returns that differ by less are equal
 
 
@@ -92,7 +93,9 @@ def read_runs(paths):
     The columns of VALUES are a run's final performance; `scaled` is 0 for the random policy and 1 for the scripted.
     `solved_at` is the step of the last of KEPT evaluations, nan for never; `needed` is the budget then.
     """
-    found, kept, notes = [], [], []
+    found = []
+    kept = []
+    notes = []
     for path in map(Path, paths):
         try:
             kept += record.load_runs(path.resolve(strict=True))
@@ -141,7 +144,8 @@ def panels_of(section, runs):
 
     A panel is a task, where algorithms are compared, or a task and an algorithm, of which variants are compared.
     """
-    names, panels = PAPER["names"], {}
+    names = PAPER["names"]
+    panels = {}
     variants = section.get("variants") or {variant: f" {variant}".rstrip() for variant in runs["variant"]}
     for panel in itertools.chain.from_iterable(section["panels"]):
         env, _, kind = panel.partition(" ")
@@ -160,7 +164,8 @@ def plot(path, widths, panels, draw_panel, empty):
     """
     plt.rcParams.update(PAPER["matplotlib"])
     figure = plt.figure(figsize=(max(9, 3.5 * max(widths)), 1 + 3.2 * len(widths)))
-    titles, others = iter(panels), itertools.cycle(PAPER["other styles"])
+    titles = iter(panels)
+    others = itertools.cycle(PAPER["other styles"])
     mosaic = [[*itertools.islice(titles, width), *["."] * (max(widths) - width)] for width in widths]
     labels = {label for runs in panels.values() for label in runs["label"]}
     styles = PAPER["styles"] | {label: next(others) for label in sorted(labels - PAPER["styles"].keys())}
@@ -188,7 +193,8 @@ def draw(ax, runs, styles, evaluations, shares=False):
     lowest = floor - (ceiling - floor) / 2  # early curves may go far down; a band is not drawn without its curve
     for i, (label, of) in enumerate(groups):
         curves = evaluations[evaluations["run"].isin(of.index)].pivot(index="run", columns="step", values="return")
-        middle, error = curves.dropna(axis=1).mean(), curves.dropna(axis=1).sem()
+        middle = curves.dropna(axis=1).mean()
+        error = curves.dropna(axis=1).sem()
         if middle.empty:  # no two of these runs were evaluated at the same steps
             continue
         x = middle.index / (middle.index[-1] / 100 if shares else 1000)
@@ -258,13 +264,17 @@ def compare(a, b, digits):
 
 def tables(panels, paper):
     """Two tables: what the runs of each label end with and the paper's number, and what pairs of labels differ by."""
-    rows, pairs, p, scaled = [], [], [], {}
+    rows = []
+    pairs = []
+    p = []
+    scaled = {}
     for panel, runs in panels.items():
         env = runs["env"].iloc[0]
         digits = 1 if env.startswith(("bp", "wtd")) else 3
         groups = dict(list(runs.groupby("label", sort=False)))
         for label, of in groups.items():
-            k, n = of["solved_at"].count(), len(of)
+            k = of["solved_at"].count()
+            n = len(of)
             low, high = stats.binomtest(k, n).proportion_ci(method="exact")
             row = {"task": panel, "": label, "paper": paper.get(env, {}).get(label), "runs": n}
             for column, x in (("return: mean ± SE", of["return"]), ("discounted", of["discounted_return"])):
@@ -297,7 +307,8 @@ def tables(panels, paper):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: sys.exit(f"report: {message}")
-    add, results = parser.add_argument, record.RESULTS
+    add = parser.add_argument
+    results = record.RESULTS
     add("runs", nargs="*", default=[results], metavar="RUNS", help="default: benchmark/results")
     add("-o", "--output", type=record.folder, default=results, help="folder (default: benchmark/results)")
     args = parser.parse_args(argv)
@@ -306,7 +317,9 @@ def main(argv=None):
         runs, evaluations, notes = read_runs(args.runs)
         for note in notes:
             record.tell(f"report: {note}")
-        shown, missing, text = set(), [], ""
+        shown = set()
+        missing = []
+        text = ""
         for title, section in PAPER["sections"].items():
             rest = list(runs.drop(shown)["env"].unique())  # tasks of runs that no section before has shown
             rows = section["panels"] or [rest[i : i + 4] for i in range(0, len(rest), 4)]
@@ -318,7 +331,8 @@ def main(argv=None):
                 continue
             shown |= new
             name = title.lower().replace(" ", "-")
-            widths, shares = [len(row) for row in rows], section.get("shares", False)
+            widths = [len(row) for row in rows]
+            shares = section.get("shares", False)
             curves = partial(draw, evaluations=evaluations, shares=shares)
             plot(args.output / f"{name}.png", widths, panels, curves, "no runs yet")
             text += f"## {title}\n\n{section['about']}\n\n![{title}]({name}.png)\n\n"

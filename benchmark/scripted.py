@@ -73,13 +73,15 @@ def deliver(env, rng, loads):
     The arm passes the oldest staged tool as soon as its robot waits at the table, else searches the next one if there
     is room. A robot waits until its load is complete, delivers it in order and comes back.
     """
-    get_tool, capacity = env.n_humans + 1, env.staging_capacity
+    get_tool = env.n_humans + 1
+    capacity = env.staging_capacity
     robot = np.array([robot for robot, humans in loads for _ in humans])  # [tools], of each tool in the arm's order
     human = np.array([human for _, humans in loads for human in humans])
     completes = np.concatenate([np.arange(len(humans)) == len(humans) - 1 for _, humans in loads])
     tool = np.array([(human[:k] == human[k]).sum() for k in range(len(human))])
 
-    found, staged = env.found.sum(1), (env.staged >= 0).sum(1)  # [N]
+    found = env.found.sum(1)  # [N]
+    staged = (env.staged >= 0).sum(1)  # [N]
     handed = np.arange(len(tool)) < (found - staged)[:, None]  # [N, tools]
     received = env.phase + env.has_next_tool  # [N, humans]
     to_deliver = handed & (tool >= received[:, human])
@@ -186,15 +188,18 @@ def script_of(env_id):
 
 def play(env_id, policy, episodes, seed, gamma):
     """Plays episodes side by side: a dict of return, discounted_return, length and success, float64 [episodes] each."""
-    env, rng = envs.make(env_id, episodes), np.random.default_rng(seed)
+    env = envs.make(env_id, episodes)
+    rng = np.random.default_rng(seed)
     env.reset(seed=seed)
     result = {key: np.zeros(episodes) for key in ("return", "discounted_return", "length", "success")}
-    live, step = np.ones(episodes, bool), 0
+    live = np.ones(episodes, bool)
+    step = 0
     while live.any():
         _, rewards, terminations, truncations, infos = env.step(policy(env, rng))
         for key, value in zip(result, (rewards, gamma**step * rewards, 1, infos["success"]), strict=True):
             result[key] += live * value
-        over, step = terminations | truncations, step + 1
+        over = terminations | truncations
+        step = step + 1
         live &= ~over
         if over.any():  # play on in ended environments without looking
             env.reset(options={"reset_mask": over})

@@ -105,11 +105,13 @@ def plan(name, args, steps):
     common |= {"eval-frequency": 10**9, "checkpoint-frequency": 10**9}
     if hasattr(args, "train_frequency"):
         common["train-frequency"] = args.train_frequency
-        idle, learning = {"learning-starts": total}, {"learning-starts": first}
+        idle = {"learning-starts": total}
+        learning = {"learning-starts": first}
         updates = total // args.train_frequency - first // args.train_frequency
         updates_per_step = 1 / args.train_frequency
     else:  # an actor-critic learns from every batch of episodes: it does not where the batch is never full
-        idle, learning = {"batch-size": total}, {}
+        idle = {"batch-size": total}
+        learning = {}
         updates = total
         updates_per_step = 1
     if not updates:
@@ -133,7 +135,8 @@ def scale(name, mixer_state, size, updates):
     mixer_state: None for a script without a mixer. size: as SIZE. updates: how many are timed.
     """
     torch.set_num_threads(1)
-    script, env_id = record.load_script(name), "ct-" + "-".join(str(size[key]) for key in ("agents", "grid", "horizon"))
+    script = record.load_script(name)
+    env_id = "ct-" + "-".join(str(size[key]) for key in ("agents", "grid", "horizon"))
     if envs.problem(env_id):
         envs.register(env_id, CaptureTarget, n_agents=size["agents"], grid=size["grid"], horizon=size["horizon"])
     args = script.parse_args([f"--env={env_id}", *([f"--mixer-state={mixer_state}"] if mixer_state else [])])
@@ -196,7 +199,8 @@ def count(text):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: sys.exit(f"speed: {message}")
-    add, tasks = parser.add_argument, ["wtd-s", "bp-10", "ct-10"]
+    add = parser.add_argument
+    tasks = ["wtd-s", "bp-10", "ct-10"]
     add("--scripts", nargs="+", default=record.scripts(), choices=record.scripts(), metavar="NAME", help="default: all")
     add("--envs", nargs="+", default=tasks, choices=envs.IDS, metavar="ID", help=f"default: {' '.join(tasks)}")
     add("--num-envs", type=count, help="environments side by side (default: the script's)")
@@ -209,7 +213,8 @@ def main(argv=None):
         if any(v != parser.get_default(k) for k, v in vars(args).items() if k not in ("scaling", "rounds")):
             sys.exit("speed: --scaling measures sizes of its own: only --rounds goes with it")
         return print_scaling(5 * args.rounds)
-    checkouts, cells = [record.ROOT, *([args.against] if args.against else [])], []
+    checkouts = [record.ROOT, *([args.against] if args.against else [])]
+    cells = []
     for name, env_id in itertools.product(args.scripts, args.envs):
         if not (checkouts[-1] / f"{name}.py").is_file():
             sys.exit(f"speed: there is no {checkouts[-1] / name}.py")
@@ -220,7 +225,9 @@ def main(argv=None):
     torch.set_num_threads(1)
     print(f"{'measure':34} {'ms each':>9}", f"{'there':>9}  median ratio (of all rounds)" if args.against else "")
     for script, usual in cells:
-        name, env_id, measures = script.__name__, usual.env, {}
+        name = script.__name__
+        env_id = usual.env
+        measures = {}
         if not args.against:
             env = envs.make(env_id, usual.num_envs)
             agents = script.make_learner(usual, env)["agents"]

@@ -92,7 +92,12 @@ def was_stopped(code):
 
 def run_job(job):
     """Runs a job to its end, from its checkpoint if there is one, and returns it as it ended; also in a Ray task."""
-    started, attempts, code, error, folder, result = time.time(), 0, None, "", None, None
+    started = time.time()
+    attempts = 0
+    code = None
+    error = ""
+    folder = None
+    result = None
     path = Path(job["place"]) / LOG
     path.parent.mkdir(exist_ok=True)
     with open(path, "a") as log:
@@ -153,7 +158,8 @@ def start_ray(args):
         return run_job(job)
 
     def run_there(job):
-        task, cancelled = ray.remote(num_cpus=1, max_retries=LOST_WORKERS)(run).remote(job), 0
+        task = ray.remote(num_cpus=1, max_retries=LOST_WORKERS)(run).remote(job)
+        cancelled = 0
         while not ray.wait([task], timeout=0.2)[0]:
             if len(stop) > cancelled:
                 cancelled = len(stop)
@@ -218,7 +224,8 @@ def seeds(text):
 
 def make_jobs(args, options):
     """The jobs of a sweep. Bad flags behind -- end the program, bad values of them in the words of the script."""
-    cells, jobs = [], []
+    cells = []
+    jobs = []
     for algorithm, env in dict.fromkeys(itertools.product(args.algos, args.envs)):
         usual = {"env": env, "seed": 2**31 - 1, "runs_dir": "runs of a sweep"}  # that differ from any behind --
         own = [f"--{name.replace('_', '-')}={value}" for name, value in usual.items()]
@@ -250,7 +257,8 @@ def main(argv=None):
     cut = argv.index("--") if "--" in argv else len(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: sys.exit(f"sweep: {message}")
-    add, names = parser.add_argument, dict(nargs="+", required=True, metavar="NAME")
+    add = parser.add_argument
+    names = dict(nargs="+", required=True, metavar="NAME")
     add("--algos", choices=record.scripts(), help="names of scripts, without .py", **names)
     add("--envs", type=task, help="ids of tasks, or module:id", **names)
     add("--seeds", type=seeds, nargs="+", required=True, help="such as 1-5 or 1 3 7-9")
@@ -267,7 +275,8 @@ def main(argv=None):
     if args.address and (args.engine != "ray" or args.workers):
         sys.exit("sweep: --address needs --engine ray, and no --workers: the cluster has the CPUs it has")
     args.workers = args.workers or (None if args.address else os.cpu_count())
-    jobs, recorded = make_jobs(args, argv[cut + 1 :]), set()
+    jobs = make_jobs(args, argv[cut + 1 :])
+    recorded = set()
     try:
         for folder in [] if args.dry_run else filter(None, (args.runs_dir, args.record)):
             record.make_folder(folder)

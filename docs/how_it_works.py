@@ -21,7 +21,8 @@ RUNS = DOCS / "models"
 BLOCK = re.compile(r"(<!-- (\w+) -->\n```text\n)(.*?)(```\n)", re.DOTALL)  # (opening, name, text, end)
 MODELS = ("avf_vdn", "avf_qmix", "avf_qplex")
 MIXERS = MODELS[1:]  # those that see a state
-ROW, NEXT = 4, 5  # the page follows the transition from one row to the next
+ROW = 4  # the page follows the transition from this row
+NEXT = 5  # to this one
 
 
 class Reader:
@@ -78,11 +79,14 @@ def make_blocks():
     torch.set_num_threads(1)  # fastest for networks of this size
     script, args, learner, _ = play.load_run(RUNS / "avf_qplex", "best")
     _, recorder = play.watch(script, args, learner, 1, args.seed)
-    episode, stored = recorder.episode(), play.remember(script, args, recorder.steps)
+    episode = recorder.episode()
+    stored = play.remember(script, args, recorder.steps)
     batch = script.make_batch([stored])
     readers = {name: Reader(name, batch) for name in MODELS}
-    since, states = stored["since"], stored["state"]  # [T, n], [T, S]
-    agents, times = [f"agent {label}" for label in episode.labels], episode.rows()
+    since = stored["since"]  # [T, n]
+    states = stored["state"]  # [T, S]
+    agents = [f"agent {label}" for label in episode.labels]
+    times = episode.rows()
 
     def name(agent, action):
         return episode.names[agent][action]
@@ -93,7 +97,8 @@ def make_blocks():
     played = [("model", "of step", "return", "steps", "rows", "success")]
     for model, reader in readers.items():
         result = {key: value.item() for key, value in reader.result.items()}
-        steps, count = int(result["length"]), len(reader.recorder.episode().rows())
+        steps = int(result["length"])
+        count = len(reader.recorder.episode().rows())
         played.append((model, reader.step, result["return"], steps, count, "yes" if result["success"] else "no"))
 
     # Row by row, and the conditional argmax with its target
